@@ -119,20 +119,17 @@ def build_law(p: Parameters, initial: Estimate, executor: Executor) -> Law:
         return FixedBacklash(initial, model, noise_std, p.fixed.doubt)
     # The others take c_l < 0 < c_r for granted, unless they are told otherwise.
     (low_r, high_r), (low_l, high_l) = bounds.c_r, bounds.c_l
-    bounds = replace(
-        bounds, c_r=(max(low_r, 0.0) if high_r > 0.0 else low_r, high_r),
-        c_l=(low_l, min(high_l, 0.0) if low_l < 0.0 else high_l),
-    )
+    bounds = Bounds(bounds.m, (max(low_r, 0.0) if high_r > 0.0 else low_r, high_r),
+                    (low_l, min(high_l, 0.0) if low_l < 0.0 else high_l))
     if options.law == 'gradient':
-        blocks = build_four_blocks(p)
-        return GradientEstimator(initial, bounds, blocks, p.gradient.step, noise_std)
+        return GradientEstimator(
+            initial, bounds, build_four_blocks(p), p.gradient.step, noise_std)
     # A law averages over the noise of u by itself, but not over the bias of smoothing it away.
     reconstruction = InputReconstruction(build_model(p), noise_std, options.lag, smoothed=0.1)
+    common = initial, bounds, p.proportional.bounds, reconstruction
     if options.law == 'printed':
-        return PrintedLaw(initial, bounds, p.proportional.bounds, reconstruction)
-    return NormalisedLms(
-        initial, bounds, p.proportional.bounds, reconstruction, p.lms.step, p.lms.step_f
-    )
+        return PrintedLaw(*common)
+    return NormalisedLms(*common, p.lms.step, p.lms.step_f)
 
 
 def build_structure(p: Parameters) -> ControlStructure:
@@ -143,17 +140,16 @@ def build_structure(p: Parameters) -> ControlStructure:
         return PolePlacement(build_four_blocks(p))
     weights = Weights(p.tracking.input_weight, p.tracking.integral_weight, p.tracking.preview)
     return Tracking(
-        design(_commanded_model(p), weights), weights, p.inverse.caution,
+        design(build_state_model(p, commanded=True), weights), weights, p.inverse.caution,
         p.estimator.output_noise_std,
     )
 
 
 def build_four_blocks(p: Parameters) -> FourBlocks:
     """The gains of `pole_placement`, placed where those of `tracking` put the poles of G."""
-    state = _commanded_model(p)
+    state = build_state_model(p, commanded=True)
     model = state.transfer_function
-    weight = p.tracking.input_weight * power_gain(model, np.pi / 10.0)
-    gains = lq_gains(state, weight)
+    gains = lq_gains(state, p.tracking.input_weight * power_gain(model, np.pi / 10.0))
     closed = np.real(np.poly(state.a - np.outer(state.b, gains.state)))
     return place_poles(model, closed, p.pole_placement.filter_pole)
 
@@ -166,16 +162,10 @@ def build_limits(p: Parameters) -> Limits:
     )
 
 
-def build_state_model(p: Parameters) -> StateModel:
-    """The state space of G(z), one and the same for the same G(z)."""
-    model = build_model(p)
-    return _state_model(tuple(model.numerator), tuple(model.denominator))
-
-
-def _commanded_model(p: Parameters) -> StateModel:
-    """What y does of the command: G, or L G where there is an actuator in front."""
+def build_state_model(p: Parameters, commanded: bool = False) -> StateModel:
+    """The state space of G(z), or of L(z) G(z) from the command to y; the same one for the same."""
     model, actuator = build_model(p), build_actuator(p)
-    if actuator is not None:
+    if commanded and actuator is not None:
         model = actuator.in_front_of(model)
     return _state_model(tuple(model.numerator), tuple(model.denominator))
 
@@ -212,8 +202,7 @@ def warnings_of(p: Parameters, with_reference: bool = True) -> list[str]:
 
     with_reference: whether the parameters of the reference are those in use.
     """
-    frequency = p.frequency if with_reference else None
-    return model_warnings(build_model(p), p.sample_period, frequency)
+    return model_warnings(build_model(p), p.sample_period, p.frequency if with_reference else None)
 
 
 def _check_first_guess(p: Parameters) -> None:
