@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import inf, nan
+from math import nan
 from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
@@ -96,8 +96,8 @@ class Law:
     def update(self, y: float | None, interval: Interval) -> None:
         """Take in y(k), None if it was lost, and what was applied from k-1 to k."""
 
-    def refine(self, budget_s: float = inf) -> None:
-        """Do what the command of this sample need not wait for, for about so long at most.
+    def refine(self) -> None:
+        """Do what the command of this sample need not wait for.
 
         A law whose fits are made elsewhere (jobs/executor.py) takes up those that are
         finished, and submits the one that is due.

@@ -122,7 +122,7 @@ class ControllerNode(ManagedNode):
             lambda: next(turn).diagnose(self._rivals, self.active), clock=self.steady_clock,
         )
         if not p.lockstep:
-            self.create_timer(0.05, self._look_for_silence, clock=self.steady_clock)
+            self.create_timer(0.1, self._look_for_silence, clock=self.steady_clock)
         self._announce()
         if p.autostart:
             self.start()
@@ -212,6 +212,7 @@ class ControllerNode(ManagedNode):
         # Whoever is activated twice before everybody is there has two that wait.
         if self._driver is None:
             self._rivals.look()
+            self._steps.look()
             kept = kept_outputs(self.settings.sample_period)
             self._driver = self._io.listen(self._on_output, min(kept, DEPTH))
             emit('ready')
@@ -301,11 +302,14 @@ class ControllerNode(ManagedNode):
         elif self._knows_rivals() or not any(loop.begins for loop in loops.loops):
             self._io.serve_waiting()
             steps = loops.answer(outputs)
-            if steps:
-                if loops.keeps_up(next(iter(outputs.values())).received_ns):
+            turn = next(loops.turns)
+            if steps and (turn or self._steps.heard):
+                period_s = self.settings.sample_period
+                if next(iter(outputs.values())).received_ns > time.time_ns() - period_s * 1e9:
                     # On a busy processor the driver, woken by the command, would have to wait.
-                    time.sleep(0.05 * self.settings.sample_period)
-                loops.use_spare_time()
+                    time.sleep(0.05 * period_s)
+                if turn:
+                    turn.core.refine()
                 self._follow_up(loops, steps)
 
     def _answer_pairs(self) -> None:
@@ -315,6 +319,7 @@ class ControllerNode(ManagedNode):
             steps = loops.answer({'': pair[0]}, pair[1])
             if steps:
                 loops.by_name[''].core.refine()
+                self._steps.look()
                 self._follow_up(loops, steps)
 
     def _follow_up(self, loops: JointLoops, steps: Mapping[str, ControlStep]) -> None:
@@ -366,6 +371,7 @@ class ControllerNode(ManagedNode):
         if loops is None or not self.active:
             return
         self._io.serve_waiting()
+        self._steps.look()
         for joint in self.joints:
             joint.save_now_and_then()
         if loops.give_up_silent():

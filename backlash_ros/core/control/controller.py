@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
-from math import inf, nan
+from math import nan
 from typing import NamedTuple
 
 from backlash_ros.core.control.inverse import BacklashInverse
@@ -19,7 +19,6 @@ from backlash_ros.core.law import Interval, Law, StateSource
 
 # Lost outputs in a row that are stepped over; after more nothing is left to predict from them.
 LONGEST_GAP = 1000
-REFINE_SHARE = 0.3  # of a sample period for `refine`, after the command
 
 
 class ControlStep(NamedTuple):
@@ -91,12 +90,9 @@ class AdaptiveController:
             self.lost_samples += lost
         return self._control(y, y_m)
 
-    def refine(self, budget_s: float = inf) -> None:
-        """Do what the command did not have to wait for, for about so many seconds at most.
-
-        Who has no time for it leaves it out: a search for the gap pauses.
-        """
-        self.estimator.refine(budget_s)
+    def refine(self) -> None:
+        """Do what the command did not have to wait for; who has no time for it leaves it out."""
+        self.estimator.refine()
         if self.redesign is None:
             return
         design = self.redesign.due(self.estimator.proposal, self.structure, self._serial)

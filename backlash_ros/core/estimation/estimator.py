@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
-from math import hypot, inf, nan
+from math import hypot, nan
 from typing import NamedTuple
 
 import numpy as np
@@ -247,7 +247,7 @@ class MovingHorizon(Law):
         if status is not self.estimate.status:
             self.estimate = replace(self.estimate, status=status)
 
-    def refine(self, budget_s: float = inf) -> None:
+    def refine(self) -> None:
         channel, following, setup = self._channel, self._following, self._setup
         if channel.busy:
             self._take(channel.poll())

@@ -65,7 +65,12 @@ class DriverPeriod:
         if self._since_learned < LEARN_PERIOD_AFTER:
             return
         self._since_learned = 0
-        nominal_s, found = self.nominal_s, self.newest(50)
+        nominal_s, stamps, intervals = self.nominal_s, self._stamps_ns, 50
+        if self.period_ns == 1e9 * nominal_s and len(stamps) > intervals:
+            periods = (stamps[-1] - stamps[-1 - intervals]) / self.period_ns
+            if abs(periods - intervals) < OTHER_PERIOD * intervals:
+                return  # as nearly always: what follows takes as long as a command
+        found = self.newest(intervals)
         if found.differs_from(nominal_s, OTHER_PERIOD):
             self.period_ns = 1e9 * found.mean
         elif self.period_ns != 1e9 * nominal_s and isfinite(found.mean):

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import cycle
 from math import isfinite
 
-from backlash_ros.core.control.controller import REFINE_SHARE, ControlStep
+from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.jobs.executor import Executor
 from backlash_ros.core.loop.control_loop import ControlLoop, Driver
@@ -20,7 +19,8 @@ class JointLoops:
     """Answers a message about all joints with one of commands for all; no loop knows another.
 
     send: takes v, by joint, to the driver. driver: what can be asked about that of a joint.
-    by_name: the loops, in the order of `joints`; a single one may be nameless.
+    by_name: the loops, in the order of `joints`; a single one may be nameless. turns: for each
+    sample the loop that may take up and submit fits after it, None for none.
     """
 
     def __init__(
@@ -39,8 +39,9 @@ class JointLoops:
             ) for joint in p.joint_names
         }
         self.loops = tuple(self.by_name.values())
-        self._period_s, self._turns = p.sample_period, cycle(self.loops)
-        self._behind = 0  # outputs in a row that were answered after the next one had come
+        # To look after fits costs more than to wait for them, and they take longer than this.
+        pause = max(round(0.02 / p.sample_period / len(self.loops)), 1)  # samples
+        self.turns = cycle([turn for loop in self.loops for turn in (loop, *[None] * (pause - 1))])
 
     def answer(
         self, outputs: Mapping[str, Output], y_m: float | None = None,
@@ -66,24 +67,6 @@ class JointLoops:
         self._send_waiting()
         self.counter.sender.learn()
         return steps
-
-    def keeps_up(self, received_ns: int) -> bool:
-        """Whether the output that was answered was the newest one, as far as can be known.
-
-        received_ns: when it came, by the system clock; 0: not known.
-        """
-        is_behind = 0 < received_ns < time.time_ns() - self._period_s * 1e9
-        self._behind = self._behind + 1 if is_behind else 0
-        return not is_behind
-
-    def use_spare_time(self) -> None:
-        """Let the next loop take up and submit fits, once the commands have left.
-
-        Where the next output is waiting already, there is no time for what may be put off.
-        """
-        put_off = 5  # samples for which one that is behind may leave it alone
-        if self._behind % put_off == 0:
-            next(self._turns).core.refine(REFINE_SHARE * self._period_s)
 
     def take_references(self, y_m: Mapping[str, float]) -> None:
         """Take in references by joint."""

@@ -77,7 +77,8 @@ class SampleCounter:
         self._repeated = 0  # of the newest message that followed it too early to be a sample
         self._stamp_ns = 0  # of the newest sample
         self._early_ns = 0.0  # the earliest time at which the newest sample may have been due
-        self._lateness_ns: deque[float] = deque(maxlen=PHASE_SAMPLES)  # against due_ns
+        self._lateness_ns: deque[float] = deque(maxlen=PHASE_SAMPLES)  # before any shift
+        self._shifted_ns = 0.0  # by how much due_ns was shifted so far
         self._on_time = 0  # samples that came when they were due, less the early ones
         self._strange = 0  # messages in a row that do not follow the newest sample
 
@@ -144,15 +145,14 @@ class SampleCounter:
         period, latenesses = self.sender.period_ns, self._lateness_ns
         expected = self.due_ns + period * (1 + missing)
         late = stamp_ns - expected
-        latenesses.append(late)
+        latenesses.append(late + self._shifted_ns)
         shift = min(late, period * CLOCK_SLACK)
         if shift > 0.0:
             window = PHASE_SAMPLES if self._on_time >= KEEPS_TIME_AFTER else PHASE_AT_START
             if len(latenesses) >= window:
-                shift = max(shift, min(islice(reversed(latenesses), window)))
-        if shift != 0.0:
-            for i, each in enumerate(latenesses):
-                latenesses[i] = each - shift
+                least = min(islice(reversed(latenesses), window))
+                shift = max(shift, least - self._shifted_ns)
+        self._shifted_ns += shift
         self.due_ns = expected + shift
         # Who was held up for some samples comes back to the old phase: this one lags behind.
         early = self._early_ns + period * (1 + missing + CLOCK_SLACK)

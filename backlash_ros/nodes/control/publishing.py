@@ -41,28 +41,27 @@ class WatchPublisher:
                 event_callbacks=without_events(),
             ) for label in topics.WATCH_LABELS
         }
-        self._heard: list[str] = []  # labels with a subscriber
-        self._looked_at_s = self._due_s = -inf
+        self.heard: list[str] = []  # labels with a subscriber
+        self._due_s = -inf
         self._u_waits = False  # for the sample after that of the newest v
 
-    def is_heard(self, now_s: float) -> bool:
-        """Whether anybody listens, as far as was looked lately; now_s: on the steady clock."""
-        if now_s >= self._looked_at_s + 0.5:
-            self._looked_at_s = now_s
-            self._heard = [
-                label for label, publisher in self._publishers.items()
-                if publisher.get_subscription_count()
-            ]
-        return bool(self._heard)
+    def look(self) -> bool:
+        """Look who listens; returns whether anybody does."""
+        self.heard = [
+            label for label, publisher in self._publishers.items()
+            if publisher.get_subscription_count()
+        ]
+        return bool(self.heard)
 
-    def follow(self, signals: Row, estimates: Row, now_s: float) -> None:
+    def follow(self, signals: Row, estimates: Row) -> None:
         """Publish what is due of a sample, given by its rows in the order of their labels."""
+        now_s = time.monotonic()
         # The comparison of times must not lose one message of each round to rounding.
-        due = self.is_heard(now_s) and now_s > self._due_s - 1e-9
-        if not due and not self._u_waits:
+        due = now_s > self._due_s - 1e-9
+        if not (self.heard and (due or self._u_waits)):
             return
         values = watched_values(signals, estimates)
-        for label in self._heard:
+        for label in self.heard:
             if self._u_waits if label == 'u_hat' else due:
                 self._publishers[label].publish(Float64(data=values[label]))
         self._u_waits = due
@@ -86,8 +85,12 @@ class StepPublisher:
     """The topics ~/signals, ~/estimates and those below ~/watch.
 
     The rows of several joints are one after the other, with the joint before each label; that of a
-    joint without a step is nan. Nothing is made that nobody listens to.
+    joint without a step is nan. Nothing is made that nobody listened to at the newest look.
+
+    heard: whether anybody did.
     """
+
+    heard = True
 
     def __init__(self, node: Node, joints: Sequence[str]) -> None:
         self._signals, self._estimates = (
@@ -104,18 +107,23 @@ class StepPublisher:
         """How many subscribers there are to every step."""
         return min(self._signals.listeners, self._estimates.listeners)
 
+    def look(self) -> None:
+        """Look who listens: to ask at every sample would take a tenth of its time."""
+        self.heard = any([
+            self._signals.listeners, self._estimates.listeners,
+            *(watch.look() for watch in self._watches.values()),
+        ])
+
     def publish(
         self, loops: Mapping[str, ControlLoop], steps: Mapping[str, ControlStep],
     ) -> None:
         """Tell of the steps of a sample."""
-        now_s = time.monotonic()
-        watches = [joint for joint in steps if self._watches[joint].is_heard(now_s)]
-        if self._signals.listeners or watches or self._estimates.listeners:
+        if self.heard:
             rows = {joint: _rows(loop, steps.get(joint)) for joint, loop in loops.items()}
             self._signals.publish(sum((signals for signals, _ in rows.values()), ()))
             self._estimates.publish(sum((estimates for _, estimates in rows.values()), ()))
-            for joint in watches:
-                self._watches[joint].follow(*rows[joint], now_s)
+            for joint in steps:
+                self._watches[joint].follow(*rows[joint])
 
 
 def _rows(loop: ControlLoop, step: ControlStep | None) -> tuple[Row, Row]:
@@ -142,16 +150,16 @@ class ModelPublisher:
             event_callbacks=without_events(),
         )
         self._joint = joint
-        self._told: StateModel | None = None  # the newest one that followed a sample
-        self._since = inf  # samples since then
+        # The newest one that followed a sample, and the number of that.
+        self._told: tuple[StateModel | None, float] = None, -inf
 
     def follow(self, loop: ControlLoop, sample_period_s: float) -> None:
         """Publish after a sample, if it is time."""
-        self._since += 1
-        learned = loop.core.estimator.learned_model
+        learned, index, (told, told_index) = \
+            loop.core.estimator.learned_model, loop.counter.index, self._told
         # Deviations and noise change with every few samples, and are of use to a reader.
-        if learned is not self._told or self._since * sample_period_s >= 1.0:
-            self._told, self._since = learned, 0
+        if learned is not told or (index - told_index) * sample_period_s >= 1.0:
+            self._told = learned, index
             self.publish(loop)
 
     def publish(self, loop: ControlLoop) -> None:

@@ -32,8 +32,11 @@ class Polled(MutuallyExclusiveCallbackGroup):
 def serve_polled(subscription: Subscription) -> None:
     """Call the callback of a polled subscription with all that has come, oldest first."""
     take, callback = subscription.handle.take_message, subscription.callback
-    while (taken := take(subscription.msg_type, subscription.raw)) is not None:
+    # Where only the newest is kept, there is no second one.
+    left = subscription.qos_profile.depth
+    while left and (taken := take(subscription.msg_type, subscription.raw)) is not None:
         callback(*taken)
+        left -= 1
 
 
 class PromptExecutor(SingleThreadedExecutor):
