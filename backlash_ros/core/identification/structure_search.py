@@ -41,8 +41,7 @@ from backlash_ros.core.identification.structure import (
 )
 from backlash_ros.core.identification.verdict import ANOTHER
 from backlash_ros.core.records.readings import quantum
-from backlash_ros.core.records.roughness import noise_of
-from backlash_ros.core.records.samples import outliers
+from backlash_ros.core.records.samples import noise_of, outliers
 
 Array = NDArray[np.float64]
 

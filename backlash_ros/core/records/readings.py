@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-FEWEST_STEPS = 20  # of y, by which a jump of it is judged
 NEARLY_ALL = 0.9  # share of what speaks for an explanation
 # Whole turns: degrees, radians, gradians, steps of encoders.
 WHOLE_TURNS = (360.0, 2.0 * np.pi, 400.0, 6400.0, 3600.0, *(2.0**n for n in range(8, 33)))
@@ -113,10 +112,17 @@ def unwrapped(values: Array) -> tuple[Array, float]:
         motion = np.convolve(np.where(jumps, 0.0, steps), np.ones(7), mode='same')[jumps]
         if (off <= max(turn_tolerance * turn, 5.0 * usual)).all() and \
                 np.mean(motion * np.sign(steps[jumps]) < 0.0) >= 0.8:
-            out = values.copy()
-            out[known[1:]] -= turn * np.cumsum(np.where(jumps, np.sign(steps), 0.0))
-            return out, turn
+            return _without(turn, np.flatnonzero(jumps), values), turn
     return values, 0.0
+
+
+def _without(turn: float, jumps: NDArray[np.intp], values: Array) -> Array:
+    """The values (N,) less a turn after each jump of the known ones."""
+    known = np.flatnonzero(np.isfinite(values))
+    moves, out = np.zeros(len(known)), values.copy()
+    moves[jumps + 1] = turn * np.sign(np.diff(values[known])[jumps])
+    out[known] -= np.cumsum(moves)
+    return out
 
 
 def without_slips(y: Array, v: Array) -> tuple[Array, float]:
@@ -126,7 +132,7 @@ def without_slips(y: Array, v: Array) -> tuple[Array, float]:
     """
     known = np.flatnonzero(np.isfinite(y))
     steps = np.diff(y[known])
-    if len(steps) < FEWEST_STEPS:
+    if len(steps) < 20:  # too few to judge a jump by
         return y, 0.0
     usual = 3.0 * float(np.percentile(np.abs(steps), 95.0))
     jumps = np.flatnonzero(np.abs(steps) > 10.0 * usual)
@@ -136,9 +142,5 @@ def without_slips(y: Array, v: Array) -> tuple[Array, float]:
         whole = np.abs(np.abs(steps[jumps]) - turn) <= usual + 1e-3 * turn
         alone = [moves[max(known[k] - 50, 0):known[k + 1] + 5].max() <= lively for k in jumps]
         if whole.all() and all(alone):
-            lost = np.zeros(len(known))
-            lost[jumps + 1] = turn * np.sign(steps[jumps])
-            out = y.copy()
-            out[known] -= np.cumsum(lost)
-            return out, turn
+            return _without(turn, jumps, y), turn
     return y, 0.0

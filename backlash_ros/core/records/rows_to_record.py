@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -64,9 +65,7 @@ def record_of(
     if sent is not None:
         v = sent - np.array([[table[0, 0]], [0.0]])
     record = on_grid(Rows(t, v, y, None if commands is None else _held(table[3])), period)
-    return usable(replace(
-        record, quantum=quantum(y), timing='; '.join([record.timing, *said]), notes=tuple(notes)
-    ))
+    return usable(record, y, said, notes)
 
 
 def readings(
@@ -79,10 +78,8 @@ def readings(
     # An angle that begins anew is far from the rows around as well.
     bad, value = failed(unwrapped(y)[0])
     if bad.any():
-        notes.append(
-            f'y reads exactly {value:.6g} in {bad.sum()} of {len(bad)} rows, far from the rows '
-            'around: taken for reads that failed'
-        )
+        notes.append(f'y reads exactly {value:.6g} in {bad.sum()} of {len(bad)} rows, far from the '
+                     'rows around: taken for reads that failed')
         y = np.where(bad, np.nan, y)
     (y, turn_of_y), (v, turn_of_v) = unwrapped(y), unwrapped(v)
     for name, turn in (('y', turn_of_y), ('v', turn_of_v)):
@@ -99,30 +96,30 @@ def readings(
 
 def record_of_samples(t: Array, v: Array, y: Array, period: float) -> Record:
     """A record from samples (N,) of a run of this package, which have their true time t [s]."""
-    record = on_grid(Rows(t - t[0], v, y), period)
-    return usable(replace(record, quantum=quantum(y)))
+    return usable(on_grid(Rows(t - t[0], v, y), period), y)
 
 
-def usable(record: Record) -> Record:
+def usable(
+    record: Record, read: Array, said: Sequence[str] = (), notes: Sequence[str] = (),
+) -> Record:
     """From the first known v on; a v that is not known is the one before it.
 
-    Before the first command the motor rests where it is. Raises RecordError where v or y are no
-    measurements.
+    Before the first command the motor rests where it is. read: readings of y, whose step counts.
+    said: on the stamps. Raises RecordError where v or y are no measurements.
     """
     _check(v=record.v, y=record.y)
     first = int(np.argmax(np.isfinite(record.v)))
     v, y, commands = _held(record.v)[first:], record.y[first:], record.commands
     if np.ptp(v) == 0.0:
-        raise RecordError(
-            f'v does not move, it is {v[0]:.6g} throughout: move it to and fro, past the gap; if '
-            'another column is the command, name it with --columns'
-        )
+        raise RecordError(f'v does not move, it is {v[0]:.6g} throughout: move it to and fro, past '
+                          'the gap; if another column is the command, name it with --columns')
     if commands is not None:
         commands = _held(commands)[first:]
         commands = np.where(np.isnan(commands), v[0], commands)
         commands = commands if np.abs(commands).max() <= LARGEST_SIGNAL else None
-    period = float(f'{record.sample_period:.9g}')
-    return replace(record, v=v, y=y, sample_period=period, commands=commands)
+    return replace(
+        record, v=v, y=y, sample_period=float(f'{record.sample_period:.9g}'), quantum=quantum(read),
+        timing='; '.join([record.timing, *said]), notes=tuple(notes), commands=commands)
 
 
 def _check(**signals: Array) -> None:
@@ -132,11 +129,9 @@ def _check(**signals: Array) -> None:
             raise RecordError(f'{name} holds no number')
         largest, swing = np.nanmax(np.abs(values)), np.nanmax(values) - np.nanmin(values)
         if largest > LARGEST_SIGNAL or 0.0 < swing < 1.0 / LARGEST_SIGNAL:
-            raise RecordError(
-                f'{name} reaches {largest:.3g} and swings by {swing:.3g}, beyond '
-                f'{1.0 / LARGEST_SIGNAL:g} to {LARGEST_SIGNAL:g}: choose another unit, drop what '
-                'is no reading'
-            )
+            raise RecordError(f'{name} reaches {largest:.3g} and swings by {swing:.3g}, beyond '
+                              f'{1.0 / LARGEST_SIGNAL:g} to {LARGEST_SIGNAL:g}: choose another '
+                              'unit, drop what is no reading')
 
 
 def _held(values: Array) -> Array:

@@ -53,9 +53,8 @@ def _guessed_unit(known: Array, period: float | None, said: list[str]) -> float:
     if period is None:
         # Seconds since 1970, of dates as well, speak for themselves.
         if whole and step >= 1.0 and np.median(np.abs(known)) < 1e9:
-            said.append(
-                't, in whole numbers, is taken as seconds; if it counts something else: --period'
-            )
+            said.append('t, in whole numbers, is taken as seconds; if it counts something else: '
+                        '--period')
         return 1.0
     for scale in (1e-3, 1e-6, 1e-9, 60.0):
         if abs(step * scale / period - 1.0) < 0.3:
@@ -82,9 +81,12 @@ def in_order(t: Array, said: list[str], what: str = 'row') -> Rows:
     what: name of a row in said, to which is added what was done. Raises RecordError where the
     stamps make no sense.
     """
-    cure = 'choose another column for t with --columns, or leave t out and give --period S'
     def count(number: int, of: str = what) -> str:
         return f'{number} {of}{"" if number == 1 else "s"}'
+
+    def refused(why: str) -> RecordError:
+        return RecordError(f't {why}: choose another column for t with --columns, or leave t out '
+                           'and give --period S')
 
     rows = np.flatnonzero(np.isfinite(t))
     if len(rows) < len(t):
@@ -97,25 +99,22 @@ def in_order(t: Array, said: list[str], what: str = 'row') -> Rows:
         said.append(f'the newest {what} stood first: turned around')
     bad = _far_off(t[rows])
     if np.mean(bad) > 0.1:
-        raise RecordError(f't jumps to and fro in {bad.sum()} of {len(rows)} {what}s: {cure}')
+        raise refused(f'jumps to and fro in {bad.sum()} of {len(rows)} {what}s')
     if bad.any():
         said.append(f'{count(int(bad.sum()))} with a stamp far off left out')
         rows = rows[~bad]
     # A clock that began anew falls back by several periods; less is disorder.
-    parts = np.split(rows, np.flatnonzero(
-        np.diff(t[rows]) < -3.0 * typical_step(t[rows])) + 1)
+    parts = np.split(rows, np.flatnonzero(np.diff(t[rows]) < -3.0 * typical_step(t[rows])) + 1)
     if len(parts) > 1:
         kept = max(parts, key=len)
         if len(kept) < 0.2 * len(rows):
-            raise RecordError(f't falls back {len(parts) - 1} times: {cure}')
-        said.append(
-            f't begins anew {count(len(parts) - 1, "time")}: the longest of {len(parts)} parts, '
-            f'{len(kept)} {what}s, is used'
-        )
+            raise refused(f'falls back {len(parts) - 1} times')
+        said.append(f't begins anew {count(len(parts) - 1, "time")}: the longest of {len(parts)} '
+                    f'parts, {len(kept)} {what}s, is used')
         rows = kept
     moved = int(np.count_nonzero(np.diff(t[rows]) < 0.0))
     if moved > 0.2 * len(rows):
-        raise RecordError(f't falls back in {moved} of {len(rows)} {what}s: {cure}')
+        raise refused(f'falls back in {moved} of {len(rows)} {what}s')
     if moved:
         rows = rows[np.argsort(t[rows], kind='stable')]
         said.append(f'{count(moved)} out of order sorted by time')
@@ -141,12 +140,11 @@ def spread_evenly(t: Array, said: list[str], *signals: Array) -> Array:
             return t
     period = float(np.median(spans[1:] / lengths[1:]))
     # The first run may have begun before the log did; a pause is between two runs.
+    starts = t[begins]
+    starts[0] += spans[0] - period * lengths[0]
     run = np.repeat(np.arange(len(begins)), np.diff(np.append(begins, len(t))))
-    place = np.arange(len(t)) - begins[run]
-    out = t[begins][run] + period * np.where(run == 0, place - lengths[0], place) + np.where(
-        run == 0, spans[0], 0.0)
     said.append(f'up to {lengths.max()} rows share a stamp, and move: spread evenly')
-    return np.asarray(out)
+    return np.asarray(starts[run] + period * (np.arange(len(t)) - begins[run]))
 
 
 def _far_off(t: Array) -> NDArray[np.bool_]:

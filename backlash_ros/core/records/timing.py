@@ -19,7 +19,7 @@ from backlash_ros.core.loop.command_history import v_of_intervals
 from backlash_ros.core.loop.sample_counter import CLOCK_SLACK, JITTER
 from backlash_ros.core.records.readings import quantum
 from backlash_ros.core.records.record import Record, RecordError, seconds
-from backlash_ros.core.records.roughness import curvature_of, noise_of, rougher
+from backlash_ros.core.records.samples import curvature_of, noise_of, rougher
 from backlash_ros.core.records.stamps import typical_step
 
 Array = NDArray[np.float64]
@@ -45,8 +45,7 @@ class Rows(NamedTuple):
     def since(self, start: float, begin: int = 0, end: int | None = None) -> Rows:
         """Some of the rows, with times that count from `start`."""
         def part(values: Array) -> Array:
-            of_rows = values.ndim == 1
-            return values[begin:end] if of_rows else values - np.array([[start], [0.0]])
+            return values[begin:end] if values.ndim == 1 else values - np.array([[start], [0.0]])
 
         return Rows(self.t[begin:end] - start, part(self.v), self.y[begin:end],
                     None if self.commands is None else part(self.commands), self.reported)
@@ -60,6 +59,12 @@ class Numbering(NamedTuple):
     begin: float
     off: Array
 
+    @staticmethod
+    def along(numbers: Numbers, t: Array) -> Numbering:
+        """With the line that fits t (M,) [s] best."""
+        period, begin = np.polyfit(numbers, t, 1).tolist()
+        return Numbering(numbers, period, begin, t - begin - period * numbers)
+
 
 def on_grid(rows: Rows, period: float | None = None, late: bool = False) -> Record:
     """Rows on a grid. period [s]: of the samples, None tells it from the stamps.
@@ -68,13 +73,12 @@ def on_grid(rows: Rows, period: float | None = None, late: bool = False) -> Reco
     are too few, or they are spread over too long a time.
     """
     nearly_even = 0.02  # of a period that stamps of even samples may be off
-    typical = typical_step(rows.t)
-    guess = period or (typical if late else _period(rows.t))
+    guess = period or (typical_step(rows.t) if late else _period(rows.t))
     rows, cut = _longest_stretch(rows, guess)
     if not np.isfinite(rows.y).any():
         raise RecordError(f'{cut}but y holds no number there: cut out one motion with --from, --to')
     if late:
-        found = _line(numbered(rows.t / guess), rows.t)
+        found = Numbering.along(numbered(rows.t / guess), rows.t)
         # All stamps together tell it better than one step does, but for how late the first and the
         # last one were, independently of each other.
         deviation = 2.0**0.5 * float(np.std(found.off)) / float(found.numbers[-1])
@@ -89,15 +93,15 @@ def on_grid(rows: Rows, period: float | None = None, late: bool = False) -> Reco
         said = f'{len(rows.t)} rows, one every {seconds(used)}'
         return _numbered_grid(rows, found.numbers, used, cut + said)
     inner = steps[steps <= BREAK]
-    jitter = 0.5 * float(np.diff(np.percentile(inner, [16.0, 84.0]))[0])
+    jitter = 0.5 * float(np.ptp(np.percentile(inner, [16.0, 84.0])))
     # A few odd ones among even stamps are told as well.
     percent = f'{100.0 * (jitter if jitter > 0.005 else float(np.std(inner))):.2g} %'
     if period is not None:
-        found = _line(numbered(rows.t / period), rows.t)
+        found = Numbering.along(numbered(rows.t / period), rows.t)
     if _are_late(rows, found):
-        said = f'stamps are uneven by {percent} of {seconds(used)}, the motion is not: rows are ' \
-               'numbered'
-        return _numbered_grid(rows, found.numbers, used, cut + said)
+        return _numbered_grid(
+            rows, found.numbers, used, f'{cut}stamps are uneven by {percent} of {seconds(used)}, '
+            'the motion is not: rows are numbered')
     if period is None and np.abs(found.off).max() <= 0.5 * used:
         rows = rows.since(found.begin)
     else:
@@ -105,8 +109,7 @@ def on_grid(rows: Rows, period: float | None = None, late: bool = False) -> Reco
     how = f'jitter by {percent} around {seconds(used)}'
     if jitter <= 1e-3 and period is not None:
         how = f'come every {seconds(_period(rows.t))}, for samples of {seconds(used)}'
-    said = f'stamps {how}: v and y are taken at them'
-    return _true_instants(rows, used, cut + said)
+    return _true_instants(rows, used, f'{cut}stamps {how}: v and y are taken at them')
 
 
 def _period(t: Array) -> float:
@@ -115,8 +118,7 @@ def _period(t: Array) -> float:
     steps = steps[steps <= BREAK * typical_step(t)]
     low, middle, high = np.percentile(steps, [15.0, 50.0, 85.0]).tolist()
     # With many equal stamps, or uneven steps, the mean tells it.
-    found = middle if high - low < 0.5 * middle else float(np.mean(steps))
-    return float(f'{found:.6g}')
+    return float(f'{middle if high - low < 0.5 * middle else float(np.mean(steps)):.6g}')
 
 
 def _longest_stretch(rows: Rows, period: float) -> tuple[Rows, str]:
@@ -142,15 +144,12 @@ def _numbering(t: Array, steps: Array, period: float) -> Numbering:
     # The median of uneven steps is off by more than a long record bears.
     usual = steps[steps < 0.5 * BREAK]
     mean = period * (float(np.mean(usual)) if usual.any() else 1.0)
-    found = []
-    for index in (
+    found = [Numbering.along(index, t) for index in (
         _risen(np.append(0.0, np.cumsum(np.round(steps)))), numbered(t / period),
-        numbered(t / mean), _risen(np.round(t / period)), _risen(np.round(t / mean)),
-    ):
-        found.append(_line(index, t))
-        # Around the line that all of them tell, as far as they are late by less than a period.
-        if found[-1].period > 0.0:
-            found.append(_line(_risen(np.round((t - found[-1].begin) / found[-1].period)), t))
+        numbered(t / mean), _risen(np.round(t / period)), _risen(np.round(t / mean)))]
+    # Around the line that all of them tell, as far as they are late by less than a period.
+    found += [Numbering.along(_risen(np.round((t - one.begin) / one.period)), t)
+              for one in found if one.period > 0.0]
     found = [one for one in found if one.period > 0.0 and one.numbers[-1] < MOST_SAMPLES]
     if not found:
         raise RecordError('t does not rise steadily: give --period S, or cut out one motion')
@@ -158,11 +157,6 @@ def _numbering(t: Array, steps: Array, period: float) -> Numbering:
     # With no more digits than the stamps bear.
     deviation = max(2.0 * float(np.std(best.off)), 1e-12 * period) / float(best.numbers[-1])
     return best._replace(period=_rounded(best.period, deviation))
-
-
-def _line(numbers: Numbers, t: Array) -> Numbering:
-    period, begin = np.polyfit(numbers, t, 1).tolist()
-    return Numbering(numbers, period, begin, t - begin - period * numbers)
 
 
 def _rounded(period: float, deviation: float) -> float:
@@ -205,16 +199,20 @@ def _are_late(rows: Rows, found: Numbering) -> bool:
 def _numbered_grid(rows: Rows, index: Numbers, period: float, said: str) -> Record:
     """Each row at its number; v holds over those that are missing."""
     count = int(index[-1]) + 1
-    held = np.searchsorted(index, np.arange(count), side='right') - 1
     y = np.full(count, np.nan)
     y[index] = rows.y
     missing = f', {count - len(index)} missing' if count > len(index) else ''
 
-    def over(values: Array, reported: bool) -> Array:
-        return values[held] if values.ndim == 1 else v_over(
-            index, rows.t, values, period, reported)
+    def over(values: Array, reported: bool = False) -> Array:
+        if values.ndim == 1:
+            return values[np.searchsorted(index, np.arange(count), side='right') - 1]
+        # What is sent more often than samples are taken is averaged.
+        if not reported and values.shape[1] > 1.5 * count:
+            return averaged(values[0] - rows.t[0], values[1], period, count)
+        stamps, sent_ns = ((1e9 * each).astype(np.int64) for each in (rows.t, values[0]))
+        return v_of_intervals(index, stamps, sent_ns, values[1], reported)
 
-    commands = None if rows.commands is None else over(rows.commands, False)
+    commands = None if rows.commands is None else over(rows.commands)
     return Record(over(rows.v, rows.reported), y, period, timing=said + missing, commands=commands)
 
 
@@ -263,18 +261,6 @@ def _true_instants(rows: Rows, period: float, said: str) -> Record:
 
     commands = None if rows.commands is None else over(rows.commands)
     return Record(over(rows.v), full, step, timing=said, commands=commands)
-
-
-def v_over(index: Numbers, t: Array, sent: Array, period: float, reported: bool) -> Array:
-    """v, at its own times [s] (2, K), over the intervals after samples at t (M,).
-
-    index (M,): numbers of the samples. What is sent more often than that is averaged.
-    """
-    count = int(index[-1]) + 1
-    if not reported and sent.shape[1] > 1.5 * count:
-        return averaged(sent[0] - t[0], sent[1], period, count)
-    stamps, sent_ns = ((1e9 * each).astype(np.int64) for each in (t, sent[0]))
-    return v_of_intervals(index, stamps, sent_ns, sent[1], reported)
 
 
 def averaged(t: Array, v: Array, step: float, count: int) -> Array:

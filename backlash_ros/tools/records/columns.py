@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 
-from backlash_ros.tools.cli import InputError
+from backlash_ros.core.records.record import RecordError
 
 ROLES = ('t', 'v', 'y')
 COMMAND = 'command'  # a fourth one, where v is what a motor encoder reports
@@ -53,16 +53,16 @@ def parse_columns(text: str) -> dict[str, str]:
 
 
 def choose_columns(
-    names: Sequence[str], given: Mapping[str, str], source: object,
+    names: Sequence[str], given: Mapping[str, str],
 ) -> tuple[dict[str, str], str]:
     """The columns of a table with these names by role, and what was guessed, '' for nothing.
 
-    given: by role, as the user says. Raises InputError that names the columns where one is missing
+    given: by role, as the user says. Raises RecordError that names the columns where one is missing
     or several may be meant.
     """
     for role, name in given.items():
         if name not in names:
-            raise InputError(f'{source}: --columns {role}={name}: {columns_of(names)}')
+            raise RecordError(f'--columns {role}={name}: {columns_of(names)}')
     found = dict(given)
     for role, meant in (('t', 'the time'), ('v', 'the command'), ('y', 'the output')):
         fitting = [found[role]] if role in found else _fitting(role, names, found)
@@ -70,8 +70,8 @@ def choose_columns(
             found[role] = fitting[0]
         elif role != 't' or fitting:
             why = 'several columns may be' if fitting else 'no column is'
-            raise InputError(f'{source}: {why} {role}, {meant}: {columns_of(names)}; name them: '
-                             '--columns "t=…,v=…,y=…"')
+            raise RecordError(f'{why} {role}, {meant}: {columns_of(names)}; name them: '
+                              '--columns "t=…,v=…,y=…"')
     if COMMAND in names and found['v'] == 'v':
         found.setdefault(COMMAND, COMMAND)
     said = ', '.join(f'{role} is {found[role]!r}' for role in ROLES
@@ -95,10 +95,8 @@ def unit_of(name: str) -> float | None:
 def _fitting(role: str, names: Sequence[str], taken: Mapping[str, str]) -> list[str]:
     """Columns that may be this, of the surest pattern that fits any."""
     words = {name: _words(name) for name in names if name not in taken.values()}
-    free = {name: text for name, text in words.items()
-            if role == 't' or not re.fullmatch(OTHERS, text)}
-    found = ([name for name, text in free.items() if re.fullmatch(pattern, text)]
-             for pattern in PATTERNS[role])
+    found = ([name for name, text in words.items() if re.fullmatch(pattern, text)
+              and (role == 't' or not re.fullmatch(OTHERS, text))] for pattern in PATTERNS[role])
     return next(filter(None, found), [])
 
 

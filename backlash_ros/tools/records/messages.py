@@ -14,17 +14,14 @@ from backlash_ros import topics
 from backlash_ros.core.loop.command_history import REPORTED
 from backlash_ros.core.loop.diagnosis import TROUBLE
 from backlash_ros.core.loop.report_origin import without_origin
-from backlash_ros.core.records.readings import quantum
 from backlash_ros.core.records.record import Record, RecordError
 from backlash_ros.core.records.rows_to_record import readings, usable
 from backlash_ros.core.records.stamps import in_order, typical_step
 from backlash_ros.core.records.timing import Rows, on_grid
-from backlash_ros.tools.cli import InputError
 from backlash_ros.tools.runs.bag import choose_namespace, read_topics
 
 Messages = tuple[NDArray[np.int64], NDArray[np.float64]]  # stamps [ns] and values
 
-NUMBER, NUMBERS = 'std_msgs/msg/Float64', 'std_msgs/msg/Float64MultiArray'
 FEWEST_MESSAGES = 3  # that are a motion
 
 
@@ -50,7 +47,7 @@ def read_bag_record(
     of_joints = any(each.joint or each.commanded for each in signals.values())
     native = any(f'/{name}'.endswith(f'/{topics.PLANT_OUTPUT}') for name in signals)
     if columns or (of_joints and not native):
-        v, y = _joint_pair(path, signals, axis, columns)
+        v, y = _joint_pair(signals, axis, columns)
         heard = {topics.CONTROL: signals[v].messages, topics.PLANT_OUTPUT: signals[y].messages}
         note, of_axis = f'v is {v}, y is {y}', ''
     else:
@@ -71,8 +68,7 @@ def from_messages(
     v is that of applied_control where it is reported, else that of control. period [s]: from sample
     to sample, None tells it from the stamps. Raises RecordError.
     """
-    said: list[str] = []
-    notes: list[str] = []
+    said, notes = list[str](), list[str]()
     begin = int(np.median(heard[topics.PLANT_OUTPUT][0]))
     sent = {topic: _by_time(messages, begin, said) for topic, messages in heard.items()
             if len(messages[0])}
@@ -94,13 +90,12 @@ def from_messages(
         lost = np.count_nonzero((t > times[0] - step) & (t <= times[-1])) - len(times)
         # A topic with fewer messages is published on change.
         if TROUBLE < lost / (lost + len(times)) < 0.5:
-            notes.append(
-                f'{lost} messages of {topic} are missing: the one before is taken for them')
+            notes.append(f'{lost} messages of {topic} are missing: the one before is taken for '
+                         'them')
             record = replace(record, commands=None)
-    v, readings_of_y = readings(
+    v, own = readings(
         step * np.arange(len(record.y), dtype=float), record.v, record.y, said, notes)
-    return usable(replace(record, v=v, y=readings_of_y, quantum=quantum(y), notes=tuple(notes),
-                          timing='; '.join([record.timing, *said])))
+    return usable(replace(record, v=v, y=own), y, said, notes)
 
 
 def _by_time(messages: Messages, begin_ns: int, said: list[str]) -> NDArray[np.float64]:
@@ -126,13 +121,13 @@ def _native(signals: Mapping[str, Signal], axis: str) -> tuple[dict[str, Message
 
 
 def _joint_pair(
-    path: Path, signals: Mapping[str, Signal], axis: str, columns: Mapping[str, str],
+    signals: Mapping[str, Signal], axis: str, columns: Mapping[str, str],
 ) -> tuple[str, str]:
-    """Names of v and y; raises InputError where they cannot be told."""
+    """Names of v and y; raises RecordError where they cannot be told."""
     names = ', '.join(sorted(signals)) or 'none'
     for name in columns.values():
         if name not in signals:
-            raise InputError(f'{path}: --columns {name}: the signals are {names}')
+            raise RecordError(f'--columns {name}: the signals are {names}')
     meant = {name: each for name, each in signals.items()
              if axis in ('', each.joint, name.split('/')[0]) or (each.commanded and not each.joint)}
     commands = [name for name, each in meant.items() if each.commanded]
@@ -140,22 +135,20 @@ def _joint_pair(
     v = columns.get('v') or (commands[0] if len(commands) == 1 else '')
     y = columns.get('y') or (outputs[0] if len(outputs) == 1 else '')
     if not (v and y):
-        raise InputError(
-            f'{path}: which signals are v and y? They are {names}: choose a joint with --axis, or '
-            'name them: --columns "v=…,y=…"'
-        )
+        raise RecordError(f'which signals are v and y? They are {names}: choose a joint with '
+                          '--axis, or name them: --columns "v=…,y=…"')
     return v, y
 
 
 def _signals(path: Path) -> tuple[dict[str, Signal], str]:
     """Every number of a bag that may be v or y, by name, and what is wrong with the bag."""
-    command_words = ('command', 'cmd', 'goal', 'target', 'setpoint')
-    joint_state = 'sensor_msgs/msg/JointState'
     def is_command(topic: str) -> bool:
-        return any(word in topic.lower() for word in command_words)
+        return any(word in topic.lower() for word in (
+            'command', 'cmd', 'goal', 'target', 'setpoint'))
 
-    content = read_topics(path, lambda topic: topic.message_type in (NUMBER, joint_state) or (
-        topic.message_type == NUMBERS and is_command(topic.name)))
+    content = read_topics(path, lambda topic: topic.message_type in (
+        'std_msgs/msg/Float64', 'sensor_msgs/msg/JointState') or (
+        topic.message_type == 'std_msgs/msg/Float64MultiArray' and is_command(topic.name)))
     series: dict[tuple[str, str, str], list[tuple[int, float]]] = {}
     for topic, messages in sorted(content.messages.items()):
         for stamp, message in messages:

@@ -51,23 +51,18 @@ def _read(path: Path, period: float | None, axis: str, columns: Mapping[str, str
         return record
     if bag is None and path.is_dir() and not any(
             (path / name).is_file() for name in (RECORD_FILE, SAMPLES_FILE)):
-        raise InputError(
-            f'{path}: holds no bag, no {RECORD_FILE} and no {SAMPLES_FILE}: give one of them, or a '
-            'table with t, v and y'
-        )
+        raise RecordError(f'holds no bag, no {RECORD_FILE} and no {SAMPLES_FILE}: give one of '
+                          'them, or a table with t, v and y')
     source = read_run(path, axis=axis)
     run = source.record
     if not run.samples:
-        raise InputError(f'{path}: holds no sample')
-    record = record_of_samples(
-        run.column('t'), run.column('v'), run.column('y'), period or run.sample_period
-    )
-    return replace(record, notes=source.notes)
+        raise RecordError('holds no sample')
+    t, v, y = (run.column(name) for name in 'tvy')
+    return replace(record_of_samples(t, v, y, period or run.sample_period), notes=source.notes)
 
 
 def _from_table(table: Table, period: float | None, given: Mapping[str, str]) -> Record:
-    table = table.by_name()
-    chosen, said = choose_columns(table.names, given, table.path)
+    chosen, said = choose_columns(table.names, given)
     t, unit_s = table.times(chosen.pop('t')) if 't' in chosen else (None, None)
     signals = {role: table.numbers(name) for role, name in chosen.items()}
     record = record_of(t, signals['v'], signals['y'], period, unit_s, signals.get(COMMAND))
@@ -134,11 +129,8 @@ def _as_run(record: Record) -> tuple[RunRecord, list[list[float]]]:
     known = np.flatnonzero(np.isfinite(record.y))
     rows = np.full((len(known), len(COLUMNS)), np.nan)
     y = record.y[known]
-    for name, values in (
-        ('t', record.sample_period * (known - known[0])), ('y_m', y), ('y', y),
-        ('v', record.v[known]),
-    ):
-        rows[:, COLUMNS.index(name)] = values
+    rows[:, [COLUMNS.index(name) for name in ('t', 'y_m', 'y', 'v')]] = np.column_stack(
+        [record.sample_period * (known - known[0]), y, y, record.v[known]])
     lost = int(known[-1] - known[0] + 1 - len(known))
     applied = [[], *(part.tolist() for part in np.split(record.v, known)[1:-1])]
     return RunRecord(rows, record.sample_period, lost), applied

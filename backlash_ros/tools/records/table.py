@@ -13,14 +13,14 @@ import re
 import zlib
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import nan
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.tools.cli import InputError
+from backlash_ros.core.records.record import RecordError
 from backlash_ros.tools.records.columns import UNITS_S, columns_of, unit_of
 from backlash_ros.tools.records.dates import times_of
 
@@ -40,14 +40,13 @@ class Table:
     sign of the numbers.
     """
 
-    path: Path
     names: tuple[str, ...]
     cells: tuple[Sequence[str] | Array, ...]
     comma: bool = False
     notes: tuple[str, ...] = ()
 
     def times(self, name: str) -> tuple[Array, float | None]:
-        """Stamps (N,), and their unit [s] where the file tells it; raises InputError."""
+        """Stamps (N,), and their unit [s] where the file tells it; raises RecordError."""
         cells = self.cells[self.names.index(name)]
         # As the first ones are.
         numeric = [isinstance(cell, float) or _number(cell, self.comma) is not None
@@ -67,7 +66,7 @@ class Table:
         return t, unit_of(name)
 
     def numbers(self, name: str, what: str = 'number') -> Array:
-        """A column as numbers (N,), nan where there is none; raises InputError."""
+        """A column as numbers (N,), nan where there is none; raises RecordError."""
         cells = self.cells[self.names.index(name)]
         if isinstance(cells, np.ndarray):
             return cells
@@ -75,11 +74,10 @@ class Table:
         values = np.array([nan if value is None else value for value in read])
         broken = [k for k in np.flatnonzero(np.isnan(values)) if cells[k].lower() not in NOT_KNOWN]
         if len(broken) > MOST_BROKEN * len(cells):
-            raise InputError(
-                f'{self.path}: column {name!r}: {cells[broken[0]]!r} in row {broken[0] + 1} is no '
-                f'{what}, as in {len(broken)} of {len(cells)} rows: '
-                f'choose another column with --columns; {columns_of(self.names)}'
-            )
+            raise RecordError(
+                f'column {name!r}: {cells[broken[0]]!r} in row {broken[0] + 1} is no {what}, as in '
+                f'{len(broken)} of {len(cells)} rows: choose another column with --columns; '
+                f'{columns_of(self.names)}')
         return values
 
     def by_name(self) -> Table:
@@ -95,12 +93,12 @@ class Table:
         if len(of_values) != 1 or len(words) != 1:
             return self
         keys, values = self.cells[words[0]], self.cells[of_values[0]]
-        kept = [k for k in range(len(self.names)) if k not in (words[0], of_values[0])]
-        names = sorted({str(key) for key in keys})
-        return Table(self.path, (*(self.names[k] for k in kept), *names), (
-            *(self.cells[k] for k in kept),
-            *([str(value) if key == name else '' for key, value in zip(keys, values, strict=True)]
-              for name in names)), self.comma, self.notes)
+        kept = {name: cells for k, (name, cells) in enumerate(
+            zip(self.names, self.cells, strict=True)) if k not in (words[0], of_values[0])}
+        for name in sorted({str(key) for key in keys}):
+            kept.setdefault(name, [str(value) if key == name else ''
+                                   for key, value in zip(keys, values, strict=True)])
+        return replace(self, names=tuple(kept), cells=tuple(kept.values()))
 
 
 def _number(cell: str, comma: bool) -> float | None:
@@ -115,31 +113,28 @@ def _number(cell: str, comma: bool) -> float | None:
 
 
 def read_table(path: Path) -> Table:
-    """The table of a file; raises InputError, in one line."""
+    """The table of a file; raises RecordError, in one line."""
     try:
         data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f'{path}: cannot be read: {error}') from None
-    if data[:2] == b'\x1f\x8b':
-        try:
+        if data[:2] == b'\x1f\x8b':
             data = gzip.decompress(data)
-        except (EOFError, OSError, zlib.error) as error:
-            raise InputError(f'{path}: cannot be unpacked: {error}') from None
+    except (EOFError, OSError, zlib.error) as error:
+        raise RecordError(f'cannot be read: {error}') from None
     if data[:4] == b'PAR1':
         return _from_parquet(path)
     wide = 'utf-16' if data[:2] in (b'\xff\xfe', b'\xfe\xff') else \
         'utf-16-le' if b'\0' in data and not data[1:200:2].strip(b'\0') else ''
     if b'\0' in data[:4096] and not wide:
-        raise InputError(f'{path}: is no text: give a CSV, a Parquet file, or the folder of a bag')
+        raise RecordError('is no text: give a CSV, a Parquet file, or the folder of a bag')
     for encoding in (wide,) if wide else ('utf-8-sig', 'latin-1'):
         try:
-            return _from_text(path, data.decode(encoding))
+            return _from_text(data.decode(encoding)).by_name()
         except UnicodeDecodeError:
             continue
-    raise InputError(f'{path}: is no text')
+    raise RecordError('is no text')
 
 
-def _from_text(path: Path, text: str) -> Table:
+def _from_text(text: str) -> Table:
     lines = [line for line in text.replace('\0', '').replace('−', '-').splitlines()
              if line.strip()]
     comments = [line.lstrip().startswith(('#', '%', '//')) for line in lines]
@@ -152,8 +147,8 @@ def _from_text(path: Path, text: str) -> Table:
     data = [count - 1 <= len(row) <= count + 1 and number and not comment
             for row, number, comment in zip(rows, numeric, comments, strict=True)]
     if not count or not any(data):
-        raise InputError(f'{path}: holds no table: give rows of numbers with t, v and y, separated '
-                         'by , ; or tabs')
+        raise RecordError(
+            'holds no table: give rows of numbers with t, v and y, separated by , ; or tabs')
     # From the middle of the file upwards: a table may stand below other ones.
     first = min(np.flatnonzero(data).tolist(), key=lambda k: abs(k - len(rows) // 2))
     filled = sum(map(bool, rows[first]))
@@ -174,14 +169,12 @@ def _from_text(path: Path, text: str) -> Table:
     body = [[*rows[k], *[''] * (count - len(rows[k]))][:count] for k in below if data[k]]
     skipped = len(below) - len(body)
     if skipped > max(MOST_BROKEN * len(body), 3.0):
-        raise InputError(
-            f'{path}: {skipped} of {skipped + len(body)} lines are no rows of its table: '
-            f'{columns_of(names)}; leave one table with t, v and y'
-        )
+        raise RecordError(f'{skipped} of {skipped + len(body)} lines are no rows of its table: '
+                          f'{columns_of(names)}; leave one table with t, v and y')
     cells = [cell for row in body for cell in row]
     comma = sum(',' in cell for cell in cells) > sum('.' in cell for cell in cells)
     notes = (f'{skipped} broken line{"s" if skipped > 1 else ""} left out',) if skipped else ()
-    return Table(path, tuple(names), tuple(zip(*body, strict=True)), comma, notes)
+    return Table(tuple(names), tuple(zip(*body, strict=True)), comma, notes)
 
 
 def _split(line: str, separator: str) -> list[str]:
@@ -233,14 +226,13 @@ def _from_parquet(path: Path) -> Table:
     try:
         from pyarrow import ArrowException, parquet
     except ImportError:
-        raise InputError(f'{path}: is a Parquet file: pip install pyarrow, or save it as CSV') \
-            from None
+        raise RecordError('is a Parquet file: pip install pyarrow, or save it as CSV') from None
     try:
         table = parquet.read_table(path)
         columns = [column.to_numpy() for column in table.columns]
     except (ArrowException, OSError, ValueError) as error:
-        raise InputError(f'{path}: cannot be read: {" ".join(str(error).split())}') from None
-    return Table(path, tuple(table.column_names), tuple(
+        raise RecordError(f'cannot be read: {" ".join(str(error).split())}') from None
+    return Table(tuple(table.column_names), tuple(
         column.astype('datetime64[ns]').astype(np.int64) * 1e-9 if column.dtype.kind == 'M' else
         column.astype(float) if column.dtype.kind in 'iufb' else
         ['' if cell is None else str(cell).strip() for cell in column.tolist()]

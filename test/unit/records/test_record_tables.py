@@ -9,6 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from backlash_ros.core.records.record import RecordError
 from backlash_ros.tools.cli import InputError
 from backlash_ros.tools.records.columns import choose_columns, parse_columns, unit_of
 from backlash_ros.tools.records.reading import read_record
@@ -150,10 +151,10 @@ def test_columns_without_names_go_by_their_number(tmp_path: Path) -> None:
 ])
 def test_names_that_may_mean_several_columns_are_asked_for(names, said):
     if not said:
-        assert choose_columns(names, {}, 'a')[0] == {'t': 't', 'v': 'v', 'y': 'y'}
+        assert choose_columns(names, {})[0] == {'t': 't', 'v': 'v', 'y': 'y'}
         return
-    with pytest.raises(InputError, match=said) as told:
-        choose_columns(names, {}, 'a')
+    with pytest.raises(RecordError, match=said) as told:
+        choose_columns(names, {})
     assert '--columns "t=…,v=…,y=…"' in str(told.value)
     assert all(name in str(told.value) for name in names)
 
@@ -226,5 +227,5 @@ def test_parquet_is_read_where_pyarrow_is_installed(tmp_path, monkeypatch):
         assert record.sample_period == pytest.approx(0.02, rel=1e-6)
         assert record.y.tolist() == Y.tolist()
     monkeypatch.setitem(sys.modules, 'pyarrow', None)
-    with pytest.raises(InputError, match='pip install pyarrow'):
+    with pytest.raises(RecordError, match='pip install pyarrow'):
         read_table(tmp_path / 'a.parquet')
