@@ -95,11 +95,10 @@ def _replay(args: Sequence[str] | None) -> None:
             words = ' '.join(f'{name}={as_yaml(value)}' for name, value in change.items())
             run = source.replayed(source.parameters.replaced(change), f'{source.path.name} {words}')
             rows.append(((str(source.path), words), _numbers(run)))
-    directory = result_directory(options.out)
-    write_table(directory / TABLE, HEADER, [(*names, *values) for names, values in rows])
-    print(cli.format_table(
-        HEADER, [(*names, *map(cli.number, values)) for names, values in rows]))
-    print(directory / TABLE)
+    path = result_directory(options.out) / TABLE
+    write_table(path, HEADER, [(*names, *values) for names, values in rows])
+    print(cli.format_table(HEADER, [(*names, *map(cli.number, values)) for names, values in rows]))
+    print(path)
 
 
 def _opened(path: Path, options: argparse.Namespace, span: cli.Span) -> Source:
@@ -110,9 +109,9 @@ def _opened(path: Path, options: argparse.Namespace, span: cli.Span) -> Source:
     if run.record.samples == 0:
         raise cli.InputError(f'{path}: holds no sample')
     if run.parameters is None:
-        raise cli.InputError(
-            f'{path}: no parameters.yaml stands beside it: give --config' if applied is None else
-            f'{path}: is a log: give --config, like identified.yaml of `identify`')
+        raise cli.InputError(f'{path}: ' + (
+            'no parameters.yaml stands beside it: give --config' if applied is None else
+            'is a log: give --config, like identified.yaml of `identify`'))
     changes = {}
     for text in options.settings:
         setting = parse_setting(text)
@@ -146,8 +145,7 @@ def _one(source: Source, out: Path | None) -> None:
         (name, cli.number(recorded.column(name)[-1], 6), cli.number(summary['final'][name], 6),
          cli.number(summary['final_std'][name], 2)) for name in BACKLASH
     ]))
-    of_log = isnan(recorded.column('m')[-1])
-    print(_states(replayed) if of_log else _parted(recorded, replayed))
+    print(_states(replayed) if isnan(recorded.column('m')[-1]) else _parted(recorded, replayed))
     print(directory / FIGURE)
     print(directory / REPORT_PAGE)
 
@@ -184,27 +182,23 @@ def _numbers(run: RunRecord) -> tuple[float, ...]:
 
 def draw_replay(recorded: RunRecord, replayed: RunRecord) -> Figure:
     """m, c_r, c_l, innovation and status over time; grey: as the run had them."""
-    figure, own, hues = figures.new_figure(10.0), figures.HUES['y_m'], figures.HUES
-    rooms = figure.subplots(5, 1, sharex=True, height_ratios=[1.0, 1.0, 1.0, 1.0, 0.5])
-    t = replayed.column('t')
-    for axes, name in zip(rooms, BACKLASH, strict=False):
-        before, again = recorded.column(name), replayed.column(name)
-        std = replayed.column(f'std_{name}')
-        if np.isfinite(before).any():
-            figures.curve(axes, t, before, own, 'run', width=2.6)
-        figures.curve(axes, t, again, hues[name], 'replay')
+    t, hues = replayed.column('t'), figures.HUES
+    names = {f'${figures.HATS[name]}$ [{figures.BACKLASH_UNITS[name]}]': name for name in BACKLASH}
+    of_log = isnan(recorded.column('m')[-1])
+    figure, grid = figures.draw_panels(10.0, {
+        text: [figures.Line(t, recorded.column(name), hues['y_m'], 'run', width=2.6)] * (not of_log)
+        + [figures.Line(t, replayed.column(name), hues.get(name, hues['e']), 'replay')]
+        for text, name in {**names, 'innovation [y]': 'innovation', '': 'status'}.items()
+    }, [figures.WHOLE_RUN], height_ratios=[1.0, 1.0, 1.0, 1.0, 0.5])
+    for axes, name in zip(grid[:, 0], BACKLASH, strict=False):
+        again, std = replayed.column(name), replayed.column(f'std_{name}')
         figures.band(axes, t, again - std, again + std, hues[name])
-        low, high = np.nanpercentile(np.concatenate([before, again]), [1.0, 99.0])
+        low, high = np.nanpercentile(
+            np.concatenate([recorded.column(name), again]), [1.0, 99.0])
         room = 0.2 * (high - low) or 0.1 * max(abs(high), 1e-9)
         axes.set_ylim(low - room, high + room)
-        figures.label(axes, '', f'${figures.HATS[name]}$ [{figures.BACKLASH_UNITS[name]}]')
-    figures.legend_above(rooms[0])
-    for run, colour, width in ((recorded, own, 2.6), (replayed, hues['e'], 1.3)):
-        figures.curve(rooms[3], t, run.column('innovation'), colour, width=width)
-        rooms[4].step(t, run.column('status'), where='post', color=colour, linewidth=width)
-    figures.label(rooms[3], '', 'innovation [y]')
-    rooms[4].set_yticks([int(state) for state in Status], [state.word for state in Status])
-    figures.label(rooms[4], '', '', figures.TIME_LABEL)
+    figures.legend_above(grid[0, 0])
+    grid[-1, 0].set_yticks([int(state) for state in Status], [state.word for state in Status])
     return figure
 
 
