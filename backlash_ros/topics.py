@@ -34,6 +34,11 @@ WATCH_LABELS = (
     *(label for label in SIGNAL_LABELS if label != 'sample'),
 )
 TRUTH_LABELS = ('u', 'm', 'c_r', 'c_l', 'v', 'sample')
+# Of each array topic; numerator and denominator of MODEL are longer than one number.
+LABELS_OF = {
+    SIGNALS: SIGNAL_LABELS, ESTIMATES: ESTIMATE_LABELS, TRUTH: TRUTH_LABELS,
+    MODEL: ('numerator', 'denominator', 'delay_samples'),
+}
 
 
 def of_node(topic: str) -> str:

@@ -6,7 +6,7 @@ import fcntl
 import os
 import shutil
 import sqlite3
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ class Bag:
 
     path: folder, must not exist. storage: a key of STORAGE. Raises ParameterError.
     saved: messages that a crash leaves. saved_ns: the time from the first to the last of them.
+    survives_a_crash: whether flush() works with the version of rosbags that is installed.
     """
 
     def __init__(self, path: str, storage: str) -> None:
@@ -36,6 +37,7 @@ class Bag:
         self.saved = self.saved_ns = 0
         self._types = get_typestore(Stores.ROS2_JAZZY)
         self._lock: int | None = None
+        self.survives_a_crash = True
         if self.path.exists():
             raise ParameterError('bag', path, 'exists already', 'name a new folder')
         self._writer = Writer(self.path, version=9, storage_plugin=STORAGE[storage])
@@ -43,9 +45,10 @@ class Bag:
             with self._closed_on_error():
                 self._writer.open()
                 self._lock = lock_folder(self.path)
-                self._flush = _flush_of(self._writer)
-                if self._flush is not None:
+                try:
                     self._flush()
+                except AttributeError:
+                    self.survives_a_crash = False
                 sync_path(self.path)
                 sync_path(self.path.parent)
         except RecordingError as error:
@@ -55,11 +58,6 @@ class Bag:
                 'bag', path, f'cannot be made: {error}',
                 'name a folder where there is room and you may write',
             ) from None
-
-    @property
-    def survives_a_crash(self) -> bool:
-        """Whether flush() works with the version of rosbags that is installed."""
-        return self._flush is not None
 
     def add_topic(self, topic: str, message_type: str) -> Connection:
         """Announce a topic, with a type like std_msgs/msg/Float64; raises RecordingError."""
@@ -73,7 +71,7 @@ class Bag:
 
     def flush(self) -> None:
         """Let all that was written survive a crash and a power cut; raises RecordingError."""
-        if self._flush is not None:
+        if self.survives_a_crash:
             with self._closed_on_error():
                 self._flush()
             self._note_saved()
@@ -86,6 +84,18 @@ class Bag:
                 sync_path(file)
         self._note_saved()
         self._unlock()
+
+    def _flush(self) -> None:
+        """The only place that looks inside of rosbags, which has no such function of its own."""
+        storage: Any = self._writer.storage
+        if self._writer.storage_plugin is StoragePlugin.SQLITE3:
+            storage.conn.commit()
+            return
+        # A chunk without messages would have no time.
+        if storage.chunk.msgs:
+            storage.close_chunk()
+        storage.bio.flush()
+        os.fsync(storage.bio.fileno())
 
     def _note_saved(self) -> None:
         writer = self._writer
@@ -109,32 +119,6 @@ class Bag:
         if self._lock is not None:
             os.close(self._lock)
             self._lock = None
-
-
-def _flush_of(writer: Writer) -> Callable[[], None] | None:
-    """What writes a bag to the disk and keeps it open; None if this rosbags has changed too much.
-
-    The only place that looks inside of rosbags, which has no such function of its own.
-    """
-    storage: Any = writer.storage
-    try:
-        if writer.storage_plugin is StoragePlugin.SQLITE3:
-            commit: Callable[[], None] = storage.conn.commit
-            return commit
-        finish_chunk, stream, messages = storage.close_chunk, storage.bio, storage.chunk.msgs
-    except AttributeError:
-        return None
-    if not callable(finish_chunk) or messages:
-        return None
-
-    def flush() -> None:
-        # A chunk without messages would have no time.
-        if storage.chunk.msgs:
-            finish_chunk()
-        stream.flush()
-        os.fsync(stream.fileno())
-
-    return flush
 
 
 def lock_folder(path: Path) -> int | None:

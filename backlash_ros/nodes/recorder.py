@@ -47,16 +47,17 @@ class RecordedTopic:
     """A recorded topic, with namespace and remappings in its name, and its counts of messages."""
 
     name: str
-    connection: Connection | None
+    connection: Connection | None = None
+    newest: bytes | None = None  # serialised
     received: int = 0
     recorded: int = 0
     missed: int = 0
     sequence: int = UNNUMBERED  # of the newest message
 
 
-def _row(message: bytes | None, labels: tuple[str, ...]) -> dict[str, float]:
+def _row(topic: str, message: bytes | None) -> dict[str, float]:
     data = deserialize_message(message, Float64MultiArray).data if message else ()
-    return dict(zip(labels, data, strict=False))
+    return dict(zip(topics.LABELS_OF[topic], data, strict=False))
 
 
 class RecorderNode(ProcessNode):
@@ -74,7 +75,6 @@ class RecorderNode(ProcessNode):
         self._now_ns: int | None = 0 if p.lockstep else None  # simulated time
         self._bag: Bag | None = None
         self._channels: dict[str, RecordedTopic] = {}
-        self._newest: dict[str, bytes] = {}  # serialised, by topic
         self._first_signals = b''
         if p.bag:
             self._bag = self._open_bag(p.bag, p.storage)
@@ -82,15 +82,14 @@ class RecorderNode(ProcessNode):
         else:
             self.log.info('started: nothing is recorded, as the parameter bag names no folder')
         to = driver_topics(p)
-        arrays = topics.ESTIMATES, topics.SIGNALS, topics.MODEL, topics.TRUTH
         # y comes last of all: it starts the loop.
         recorded = {
             # A G that was learned before this recorder came belongs into the bag as well.
             topic: self._record(topic, kind, KEPT_QOS if topic == topics.MODEL else RECORDER_DEPTH)
             for topic, kind in {
-                **dict.fromkeys(arrays, Float64MultiArray), topics.DIAGNOSTICS: DiagnosticArray,
-                to.reference: to.reference_type, to.applied: to.applied_type,
-                to.control: to.control_type,
+                **dict.fromkeys(topics.LABELS_OF, Float64MultiArray),
+                topics.DIAGNOSTICS: DiagnosticArray, to.reference: to.reference_type,
+                to.applied: to.applied_type, to.control: to.control_type,
             }.items()
         }
         if p.lockstep:
@@ -118,7 +117,7 @@ class RecorderNode(ProcessNode):
 
     def finish(self) -> None:
         bag, channels = self._bag, self._channels.values()
-        if self._with_bag(Bag.close) and bag is not None:
+        if self._with_bag(Bag.close) and bag:
             self.log.info(
                 f'recorded {bag.saved} messages of {bag.saved_ns * 1e-9:.1f} s to {bag.path}'
             )
@@ -185,7 +184,7 @@ class RecorderNode(ProcessNode):
         subscription = self.listen(
             message_type, topic, partial(self._on_message, topic), qos, raw=True
         )
-        channel = self._channels[topic] = RecordedTopic(str(subscription.topic_name), None)
+        channel = self._channels[topic] = RecordedTopic(str(subscription.topic_name))
         # As bags know a type: std_msgs/msg/Float64.
         kind = f'{message_type.__module__.split(".")[0]}/msg/{message_type.__name__}'
 
@@ -213,7 +212,7 @@ class RecorderNode(ProcessNode):
             stamp_ns = info['source_timestamp'] if self._now_ns is None else self._now_ns
             if self._with_bag(lambda bag: bag.write(connection, stamp_ns, message)):
                 channel.recorded += 1
-        self._newest[topic] = message
+        channel.newest = message
         if topic == topics.SIGNALS:
             self._first_signals = self._first_signals or message
 
@@ -222,12 +221,12 @@ class RecorderNode(ProcessNode):
 
     def _tell(self) -> None:
         """Say how the run is going, of its first joint if it has several."""
-        newest = self._newest.get
-        signals = _row(newest(topics.SIGNALS), topics.SIGNAL_LABELS)
-        estimates = _row(newest(topics.ESTIMATES), topics.ESTIMATE_LABELS)
-        truth = _row(newest(topics.TRUTH), topics.TRUTH_LABELS)
+        signals, estimates, truth = (
+            _row(topic, self._channels[topic].newest)
+            for topic in (topics.SIGNALS, topics.ESTIMATES, topics.TRUTH)
+        )
         received = {topic: channel.received for topic, channel in self._channels.items()}
-        first = _row(self._first_signals, topics.SIGNAL_LABELS).get('sample', nan)
+        first = _row(topics.SIGNALS, self._first_signals).get('sample', nan)
         # A joint that was not answered has nan for everything.
         sample = min(signals.get('sample', nan), estimates.get('sample', nan))
         if isfinite(sample) and isfinite(first):

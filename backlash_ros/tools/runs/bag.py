@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import chain, pairwise
 from math import isnan
@@ -16,7 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from backlash_ros import topics
 from backlash_ros.bags.reader import REPAIR_COMMAND, BagError, BagReader, Topic
-from backlash_ros.core.loop.learned_model import LearnedModel, from_fields
+from backlash_ros.core.loop.learned_model import from_fields
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 from backlash_ros.tools.cli import WHOLE_SPAN, InputError, Span
 from backlash_ros.tools.runs.files import Run
@@ -24,12 +25,6 @@ from backlash_ros.tools.runs.files import Run
 Array = NDArray[np.float64]
 # Messages of an array topic by label, shape (N,) each, and their `stamp` [ns] since the first.
 Table = dict[str, Array]
-
-# By which a topic is known, whatever its node is called.
-ARRAY_LABELS = {
-    topics.SIGNALS: topics.SIGNAL_LABELS, topics.ESTIMATES: topics.ESTIMATE_LABELS,
-    topics.TRUTH: topics.TRUTH_LABELS, topics.MODEL: ('numerator', 'denominator', 'delay_samples'),
-}
 
 
 @dataclass
@@ -127,7 +122,7 @@ def read_bag(
     restarted, it is what the last one did within the span. axis: of several, '' for the first.
     Raises InputError, in one line, for a bag that cannot be read or holds no run.
     """
-    last_parts = {topic.rpartition('/')[2] for topic in ARRAY_LABELS}
+    last_parts = {topic.rpartition('/')[2] for topic in topics.LABELS_OF}
     content = read_topics(path, lambda topic: topic.name.rpartition('/')[2] in last_parts
                           and topic.message_type == 'std_msgs/msg/Float64MultiArray')
     try:
@@ -142,7 +137,10 @@ def read_bag(
         if count.size == 0:
             raise InputError(f'no sample has both {topics.SIGNALS} and {topics.ESTIMATES}')
         if sample_period is None:
-            sample_period = _median_period(count, signals['stamp'][of_signals])
+            steps = np.diff(signals['stamp'][of_signals]) / np.diff(count)
+            sample_period = 1e-9 * float(np.median(steps)) if steps.size else 0.0
+            if not sample_period > 0.0:
+                raise InputError('its stamps do not show the sample period: give --config')
             notes.append(
                 f'the sample period of {sample_period:.6g} s was taken from the stamps of the bag, '
                 'as no parameters were given'
@@ -160,12 +158,15 @@ def read_bag(
             f'{heard.size - count.size} samples were left out: only one of signals and estimates '
             'is in the bag'
         )
-    unknown = np.full(count.size, np.nan)
+    unknown, learned = np.full(count.size, np.nan), None
+    with suppress(KeyError, IndexError, ValueError):  # where it was not complete
+        learned = from_fields([
+            fields for stamp, fields in models
+            if signals['stamp'][0] <= stamp < span.to_s * 1e9
+        ][-1])
     record = RunRecord(
         np.column_stack([columns.get(name, unknown) for name in COLUMNS]), sample_period,
-        int(heard[-1] - heard[0]) + 1 - heard.size,
-        _learned_model([fields for stamp, fields in models
-                        if signals['stamp'][0] <= stamp < span.to_s * 1e9]),
+        int(heard[-1] - heard[0]) + 1 - heard.size, learned,
     )
     notes = [content.damage, *notes, restarted]
     return Run(record, None, columns['latency_s'], tuple(filter(None, notes)))
@@ -213,7 +214,7 @@ def _labels(message: Any) -> list[str]:
 
 def _names_of(content: Content, topic: str) -> list[str]:
     """Under which names a topic was recorded; nodes that were renamed stand behind the others."""
-    last, wanted = topic.rpartition('/')[2], set(ARRAY_LABELS[topic])
+    last, wanted = topic.rpartition('/')[2], set(topics.LABELS_OF[topic])
     return sorted((
         name for name, messages in content.messages.items() if f'/{name}'.endswith(f'/{topic}')
         or (name.rpartition('/')[2] == last and wanted <= set(_labels(messages[0][1])))
@@ -224,13 +225,13 @@ def _tabulate(
     topic: str, name: str, messages: Sequence[tuple[int, Any]], prefix: str, begin_ns: int,
 ) -> Table:
     """The messages of a topic, of several joints what is about the one with this prefix."""
-    given = _labels(messages[0][1]) or ARRAY_LABELS[topic]
+    given = _labels(messages[0][1]) or topics.LABELS_OF[topic]
     if any(len(message.data) != len(given) for _, message in messages):
         raise InputError(f'{name} has a message without a value for each label')
     values = np.array([message.data for _, message in messages], dtype=np.float64).T
     table = {label.removeprefix(prefix): column for label, column in zip(given, values, strict=True)
              if label.startswith(prefix)}
-    if missing := sorted(set(ARRAY_LABELS[topic]) - set(table)):
+    if missing := sorted(set(topics.LABELS_OF[topic]) - set(table)):
         raise InputError(f'{name} lacks {", ".join(missing)}')
     # A joint that was not answered has a row of nan.
     answered = ~np.isnan(list(table.values())).all(axis=0)
@@ -294,24 +295,9 @@ def _true_columns(v: Array, count: Array, truth: Table) -> Table:
     return {'u': u, **{f'true_{name}': truth[name][newest] for name in topics.BACKLASH}}
 
 
-def _median_period(count: Array, stamps: Array) -> float:
-    period = float(np.median(np.diff(stamps) / np.diff(count))) * 1e-9 if count.size > 1 else 0.0
-    if not period > 0.0:
-        raise InputError('its stamps do not show the sample period: give --config')
-    return period
-
-
 def _fields_of(message: Any, prefix: str) -> dict[str, list[float]]:
     """What a message tells of G, of several joints what is about the one with this prefix."""
     ends = np.cumsum([each.size for each in message.layout.dim])
     parts = zip(_labels(message), np.split(message.data, ends), strict=False)
     return {label.removeprefix(prefix): values.tolist() for label, values in parts
             if label.startswith(prefix)}
-
-
-def _learned_model(models: Sequence[dict[str, list[float]]]) -> LearnedModel | None:
-    """G as it was published last; none where that was not complete."""
-    try:
-        return from_fields(models[-1])
-    except (KeyError, IndexError, ValueError):
-        return None

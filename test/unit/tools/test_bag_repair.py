@@ -157,7 +157,7 @@ def test_sqlite_that_lost_its_end_gives_the_messages_before_it(finished):
 @pytest.mark.parametrize('storage', STORAGE)
 def test_flush_reaches_into_the_installed_rosbags(tmp_path: Path, storage: str) -> None:
     bag = Bag(str(tmp_path / 'bag'), storage)
-    assert bag.survives_a_crash, 'rosbags has changed: see _flush_of'
+    assert bag.survives_a_crash, 'rosbags has changed: see Bag._flush'
     bag.write(bag.add_topic('/number', FLOAT), 1, number_message(7))
     assert list(BagReader(bag.path).messages()) == []
     bag.flush()
