@@ -23,10 +23,14 @@ def config_folders() -> list[Path]:
     return places
 
 
-def find_config(config: Path) -> Path:
-    """Path of a configuration file: as given, or else among the shipped ones by name."""
-    if not config.exists() and config.parent == Path():
+def find_config(config: Path | None) -> Path:
+    """Path of a configuration file: as given, or else among the shipped ones by name.
+
+    None is the shipped example of the paper.
+    """
+    given = config or Path(DEFAULT_CONFIG)
+    if config is None or (not config.exists() and config.parent == Path()):
         for folder in config_folders():
-            if (folder / config.name).exists():
-                return folder / config.name
-    return config
+            if (folder / given.name).exists():
+                return folder / given.name
+    return given

@@ -65,7 +65,6 @@ class Bag:
             return self._writer.add_connection(topic, message_type, typestore=self._types)
 
     def write(self, connection: Connection, stamp_ns: int, message: bytes) -> None:
-        """Append a message in CDR; raises RecordingError."""
         with self._closed_on_error():
             self._writer.write(connection, stamp_ns, message)
 

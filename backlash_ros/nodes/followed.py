@@ -89,7 +89,6 @@ class ControllerState:
             self.scales[name] = max(self.scales[name], abs(value))
 
     def note(self, text: str) -> None:
-        """Remember what has happened now."""
         self.events.append((time.strftime('%H:%M:%S'), text))
 
     def number(self, key: str) -> float:
@@ -101,11 +100,9 @@ class ControllerState:
 
     @property
     def excitation(self) -> float:
-        """Swing of v over the gap."""
         return self.number('excitation: swing of v / gap')
 
     def is_on(self, key: str) -> bool:
-        """A switch in the diagnostics."""
         return self.values.get(key) == 'True'
 
     def silent_s(self, now_s: float) -> float:
@@ -156,7 +153,6 @@ class FollowedControllers:
         )
 
     def take_diagnostics(self) -> None:
-        """Take in what has been said of the controllers."""
         serve_polled(self._diagnostics)
 
     def _hear(self, message: DiagnosticArray, info: dict[str, Any]) -> None:
@@ -186,7 +182,6 @@ class FollowedControllers:
 
 
 def viewer_options(name: str, description: str | None, epilog: str) -> OptionParser:
-    """The options of whoever shows controllers."""
     parser = OptionParser(name, description=description, epilog=epilog,
                           formatter_class=RawDescriptionHelpFormatter)
     parser.add_argument('name', nargs='*', metavar='NAME',

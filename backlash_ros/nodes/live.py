@@ -81,7 +81,6 @@ class PageRequest(BaseHTTPRequestHandler):
     timeout = 10.0  # [s] for a browser that has fallen silent
 
     def do_GET(self) -> None:
-        """Answer it; called by the library."""
         path, _, known = self.path.partition('?known=')
         # A page from elsewhere may let a name of its own point here, and read along.
         if self.headers.get('Host', '').partition(':')[0] not in (HOST, 'localhost'):
@@ -95,7 +94,6 @@ class PageRequest(BaseHTTPRequestHandler):
             self.send_error(HTTPStatus.NOT_FOUND)
 
     def handle(self) -> None:
-        """Answer until the browser has gone."""
         with suppress(OSError):
             super().handle()
 
@@ -125,7 +123,6 @@ class LiveNode(ProcessNode):
         self._start_ns = time.time_ns()
 
     def work(self, executor: PromptExecutor) -> None:
-        """Serve the page until a signal ends it."""
         Thread(target=self._server.serve_forever, args=[PAGE_PERIOD_S], daemon=True).start()
         if ENABLED:
             emit('ready', address=self._server.address)
@@ -175,7 +172,6 @@ def content_of(state: ControllerState, now_s: float) -> dict[str, object]:
 
 
 def main(args: list[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
     arguments = sys.argv[1:] if args is None else args
     parser = viewer_options(
         LIVE, __doc__,

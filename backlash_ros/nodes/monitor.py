@@ -66,7 +66,6 @@ class MonitorNode(ProcessNode):
         self._confirmed_until_s = 0.0  # a second r resets
 
     def work(self, executor: PromptExecutor) -> None:
-        """Show controllers until a key or a signal ends it."""
         # Whatever a terminal cannot show must not end this.
         if hasattr(sys.stdout, 'reconfigure'):
             sys.stdout.reconfigure(errors='replace')
@@ -216,7 +215,6 @@ def screen(
 
 
 def plain_line(state: ControllerState, now_s: float) -> str:
-    """One controller in a line."""
     parts = [f'{state.name}: {state.word(now_s)}', ', '.join(
         f'{name} {_with_band(state, name)}' for name in BACKLASH
         if isfinite(state.estimates[name][0])
@@ -311,7 +309,6 @@ def pressed_keys() -> Iterator[Callable[[], str]]:
 
 
 def main(args: list[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
     arguments = sys.argv[1:] if args is None else args
     options = viewer_options(
         MONITOR, __doc__, 'keys: f freezes or goes on learning, c compensates or not, r (twice) '

@@ -62,7 +62,6 @@ class PlantTopics:
         self.outputs, self.newest = self.outputs + 1, sample
 
     def publish_truth(self) -> None:
-        """Publish the rows that wait."""
         for row in self.truth_rows:
             self._truth.publish(row)
         self.truth_rows.clear()
@@ -183,7 +182,6 @@ class PlantNode(ProcessNode):
         self._end_sample()
 
     def _advance(self, v: float) -> None:
-        """Apply v over one sample period."""
         if self._complete:
             return
         plant, sample = self._plant, self._plant.sample
@@ -219,7 +217,6 @@ class PlantNode(ProcessNode):
 
 
 def main(args: list[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
     return run(PLANT, PlantNode, args)
 
 

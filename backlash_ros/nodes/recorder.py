@@ -180,7 +180,6 @@ class RecorderNode(ProcessNode):
     def _record(
         self, topic: str, message_type: type[Any], qos: QoSProfile | int,
     ) -> Subscription:
-        """Record a topic."""
         subscription = self.listen(
             message_type, topic, partial(self._on_message, topic), qos, raw=True
         )

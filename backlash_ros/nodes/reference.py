@@ -159,7 +159,6 @@ class ReferenceNode(ProcessNode):
 
 
 def main(args: list[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
     return run(REFERENCE_NODE, ReferenceNode, args)
 
 

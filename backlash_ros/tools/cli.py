@@ -69,7 +69,6 @@ OPTIONS: dict[str, dict[str, Any]] = {
 
 
 def add_options(parser: argparse.ArgumentParser, *names: str) -> None:
-    """Add some of the OPTIONS."""
     for name in names:
         parser.add_argument(name, **OPTIONS[name])
 

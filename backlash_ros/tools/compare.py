@@ -47,7 +47,6 @@ class Result(NamedTuple):
 
     @property
     def row(self) -> tuple[str, ...]:
-        """The line of the table."""
         if self.note:
             return (self.name, 'broke off', *[NOTHING] * (len(COMPARISON_HEADER) - 2))
         return (self.name, *(number(merit, 3) for merit in self.merits))
@@ -156,7 +155,6 @@ def comparison_document(scenario: Parameters, results: Sequence[Result], figure:
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """The options of `compare`."""
     parser = OptionParser('compare', description=__doc__)
     cli.add_options(parser, '--config', '--set', '--axis', '--seed', '--out', '--duration')
     return parser
@@ -179,7 +177,6 @@ def _compare(args: Sequence[str] | None) -> None:
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Entry point of `compare`."""
     return cli.run_tool('compare', lambda: _compare(args))
 
 

@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from backlash_ros import shipped
 from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core.parameters import Parameters, check_names, check_value
 from backlash_ros.core.parameters.errors import ParameterError
@@ -27,6 +26,7 @@ from backlash_ros.core.parameters.table import (
     NODES,
     PARAMETERS,
 )
+from backlash_ros.shipped import find_config
 from backlash_ros.tools.cli import InputError
 
 ANY = '**'
@@ -120,8 +120,8 @@ def read_configuration(
     parsed = [parse_setting(setting) for setting in settings]
     axes, joints = (_listed(path, sections, name) for name in ('axes', 'joints'))
     for _, name, value in parsed:
-        if name == 'axes':
-            axes = Parameters({'axes': value}).axes
+        if name == 'axes' and isinstance(value, tuple):
+            axes = tuple(map(str, value))
     for axis, name, _ in parsed:
         if axis and axis not in (axes or joints):
             raise InputError(f'--set {axis}/{name}: {_no_such_axis(axis, axes or joints)}')
@@ -142,14 +142,6 @@ def effective_parameters(
 ) -> Parameters:
     """Return the complete set for one axis, as `Configuration.parameters` does."""
     return read_configuration(config, settings, seed).parameters(axis)
-
-
-def find_config(config: Path | None) -> Path:
-    """Path of a configuration file: as given, or else among the shipped ones by name."""
-    if config is not None:
-        return shipped.find_config(config)
-    examples = [folder / shipped.DEFAULT_CONFIG for folder in shipped.config_folders()]
-    return next(filter(Path.is_file, examples), examples[0])
 
 
 def parse_setting(text: str) -> Setting:

@@ -44,7 +44,6 @@ def new_figure(height: float) -> Figure:
 
 
 def png(figure: Figure) -> bytes:
-    """The figure as a PNG file."""
     buffer = io.BytesIO()
     # savefig would lay it out, and go through all there is to draw, once more.
     FigureCanvasAgg(figure).print_png(buffer)
@@ -81,7 +80,6 @@ def curve(
     axes: Axes, t: Array, values: Array, colour: str, name: str = '', style: str = '-',
     width: float = 1.3, alpha: float = 1.0,
 ) -> None:
-    """Draw one signal over time."""
     axes.plot(t, values, color=colour, linestyle=style, linewidth=width, alpha=alpha,
               label=name or '_')
 

@@ -189,7 +189,6 @@ def _tables(summary: Mapping[str, Any]) -> str:
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """The options of `report`."""
     parser = OptionParser('report', description=__doc__)
     parser.add_argument(
         'path', type=Path, help='a bag or its .mcap file, a folder of results, samples.csv, or a '
@@ -220,7 +219,6 @@ def _report(args: Sequence[str] | None) -> None:
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Entry point of `report`."""
     return cli.run_tool('report', lambda: _report(args))
 
 

@@ -26,7 +26,6 @@ from backlash_ros.topics import BACKLASH
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """The options of `simulate`."""
     parser = OptionParser('simulate', description=__doc__)
     cli.add_options(
         parser, '--config', '--set', '--axis', '--seed', '--out', '--duration', '--sweep'
@@ -155,7 +154,6 @@ def _seconds(time: float) -> str:
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Entry point of `simulate`."""
     return cli.run_tool('simulate', lambda: _simulate(args))
 
 

@@ -58,11 +58,10 @@ class ManagedNode(LifecycleNodeMixin, ProcessNode):
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         return self._tried(self._end_work)
 
+    on_shutdown = on_deactivate
+
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         return self._tried(self.cleanup)
-
-    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        return self._tried(self._end_work)
 
     def _end_work(self) -> None:
         if self.active:

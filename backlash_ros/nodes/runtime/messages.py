@@ -25,13 +25,11 @@ FLOAT64_LITTLE, FLOAT64_BIG = Struct('<4sd'), Struct('>4sd')
 
 
 def number_of(message: bytes) -> float:
-    """The number in a message."""
     number: float = (FLOAT64_LITTLE if message[1] & 1 else FLOAT64_BIG).unpack_from(message)[1]
     return number
 
 
 def message_with(number: float) -> bytes:
-    """A message with this number."""
     return FLOAT64_LITTLE.pack(b'\x00\x01\x00\x00', number)
 
 
@@ -61,7 +59,6 @@ class LabelledArrayPublisher:
 
     @property
     def listeners(self) -> int:
-        """How many subscribers there are."""
         return self._publisher.get_subscription_count()
 
     def publish(self, row: Sequence[float]) -> None:
@@ -118,12 +115,10 @@ class DiagnosticsPublisher:
 
 
 def clock_message(stamp_ns: int) -> Clock:
-    """A tick of /clock."""
     return Clock(clock=Time(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9))
 
 
 def stamp_ns_of(message: Clock) -> int:
-    """The time that a tick of /clock tells."""
     return int(message.clock.sec * 10**9 + message.clock.nanosec)
 
 

@@ -53,7 +53,6 @@ environment: the processes inherit it. Unless you set them yourself,
 
 
 def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """Options of the command line."""
     parser = OptionParser(
         'bringup', description=__doc__, epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -87,7 +86,6 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
     code = DONE
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)

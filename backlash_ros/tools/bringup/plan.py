@@ -40,7 +40,6 @@ class AxisPlan:
 
     @property
     def logs(self) -> Path:
-        """Folder of the logs."""
         return self.out / 'logs'
 
     @property
@@ -54,7 +53,6 @@ class AxisPlan:
         }.items() if waits}
 
     def titled(self, text: str) -> str:
-        """The text, with the name of the axis where there are axes."""
         return f'{self.name}: {text}' if self.name else text
 
     def process_name(self, node: str) -> str:

@@ -74,7 +74,6 @@ class Child:
 
     @property
     def has_ended(self) -> bool:
-        """Whether the process has ended, by itself or by a signal."""
         return self.process.poll() is not None
 
     def events(self, chunk: bytes) -> list[dict[str, Any]]:
@@ -150,7 +149,6 @@ class ProcessSupervisor:
 
     @property
     def children(self) -> list[Child]:
-        """All that were started."""
         return [child for stage in self._stages for child in stage]
 
     def events(self, timeout: float) -> list[tuple[ProcessPlan, dict[str, Any]]]:

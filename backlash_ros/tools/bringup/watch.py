@@ -21,7 +21,6 @@ LATE_DEADLINE_S = 10.0  # that a run in real time may take longer than it should
 
 
 def complain(message: str, name: str = 'bringup: ') -> None:
-    """Say on stderr what is going on, or wrong."""
     print(f'{name}{message}', file=sys.stderr, flush=True)
 
 
@@ -74,11 +73,9 @@ class AxisProgress:
         return {what: n for what, n in missing.items() if n > 0}
 
     def begin(self) -> None:
-        """The time starts to run."""
         self.began = self.moved = time.monotonic()
 
     def take(self, progress: Mapping[str, Any]) -> None:
-        """Take in what the recorder says."""
         sample, p = progress['sample'], self.plan.parameters
         if self.made == 0:
             self.begin()
