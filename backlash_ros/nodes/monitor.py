@@ -209,8 +209,9 @@ def screen(
             chosen = several and i == selected
             parts.append(_panel(state, now_s, width, long - panel_lines, chosen, blocks))
         else:
-            parts.append(_cropped(plain_line(state, now_s)[:width]))
-    parts += [_cropped(line, style='bold' if notice else 'dim') for line in below]
+            parts.append(Text(plain_line(state, now_s)[:width], no_wrap=True, overflow='crop'))
+    parts += [Text(line, 'bold' if notice else 'dim', no_wrap=True, overflow='crop')
+              for line in below]
     return Group(*parts)
 
 
@@ -231,55 +232,39 @@ def _panel(
     state: ControllerState, now_s: float, width: int, events: int, chosen: bool, blocks: str,
 ) -> Panel:
     """One controller in a frame. events: how many of the newest ones."""
-    inner = width - 4
+    inner, values, number = width - 4, state.values, state.number
     colour = 'red' if state.silent_s(now_s) else ('green', 'yellow', 'red')[state.level]
-    text = Text(no_wrap=True, overflow='crop')
-    text.append(state.word(now_s), style=f'bold {colour}')
     # Often the cure stands in the second line.
-    for line in [*wrap(state.message, inner), '', ''][:2]:
-        text.append('\n' + line)
+    lines = [*wrap(state.message, inner), '', ''][:2]
     for name in BACKLASH:
-        text.append('\n' + _estimate_line(state, name, inner, blocks))
-    text.append('\n' + _figures(state))
-    for clock, event in list(state.events)[max(len(state.events) - events, 0):]:
-        text.append(f'\n{clock} {event}'[:inner + 1], style='dim')
+        value, half = state.estimates[name]
+        end = axis_end(state.scales[name])
+        axis = f' {"-" if name == "c_l" else ""}{end:g}' if end else ''
+        before = f'{name:<4}{_with_band(state, name, 11)}'.ljust(32)
+        drawn = bar(value, half, end, max(inner - len(before) - len(axis), 0), blocks)
+        lines.append(f'{before}{drawn}{axis}')
+    lines += [
+        f'excitation {state.excitation:.3g} gaps   {number("rate [Hz]"):.4g} Hz   '
+        f'latency {number("latency p50 [ms]"):.3g} ms, p99 {number("latency p99 [ms]"):.3g} ms',
+        f'samples {values["samples"]}   lost {values.get("lost", "?")}   late '
+        f'{values.get("late", "?")}   {"learning" if state.is_on("learning") else "frozen"}, '
+        f'{"" if state.is_on("compensating") else "not "}compensating',
+    ] if 'samples' in values else ['', '']
+    newest = list(state.events)[max(len(state.events) - events, 0):]
+    text = Text.assemble(
+        (state.word(now_s), f'bold {colour}'), *(f'\n{line}' for line in lines),
+        *((f'\n{clock} {event}'[:inner + 1], 'dim') for clock, event in newest),
+        no_wrap=True, overflow='crop',
+    )
     return Panel(
         text, title=f'> {state.name}' if chosen else state.name, title_align='left', width=width,
         border_style='bold' if chosen else 'dim',
     )
 
 
-def _estimate_line(state: ControllerState, name: str, width: int, blocks: str) -> str:
-    """One estimate: value, half width of its band, bar, end of its axis."""
-    value, half = state.estimates[name]
-    end = axis_end(state.scales[name])
-    axis = f' {"-" if name == "c_l" else ""}{end:g}'
-    before = f'{f"{name:<4}{_with_band(state, name, 11)}":<32}'
-    drawn = bar(value, half, end, max(width - len(before) - len(axis), 0), blocks)
-    return f'{before}{drawn}{axis if end else ""}'
-
-
 def _with_band(state: ControllerState, name: str, width: int = 0) -> str:
     value, half = state.estimates[name]
     return f'{value:>{width}.5g}' + (f' ± {half:.2g}' if isfinite(half) else '')
-
-
-def _figures(state: ControllerState) -> str:
-    """Excitation, times and counts, in two lines."""
-    values, number = state.values, state.number
-    if 'samples' not in values:
-        return '\n'
-    return (
-        f'excitation {state.excitation:.3g} gaps   {number("rate [Hz]"):.4g} Hz   '
-        f'latency {number("latency p50 [ms]"):.3g} ms, p99 {number("latency p99 [ms]"):.3g} ms\n'
-        f'samples {values["samples"]}   lost {values.get("lost", "?")}   '
-        f'late {values.get("late", "?")}   {"learning" if state.is_on("learning") else "frozen"}, '
-        f'{"" if state.is_on("compensating") else "not "}compensating'
-    )
-
-
-def _cropped(line: str, style: str = '') -> Text:
-    return Text(line, no_wrap=True, overflow='crop', style=style)
 
 
 @contextmanager

@@ -320,10 +320,7 @@ def draw_log(run: RunRecord) -> Figure:
     """v and y of a log over time, and over each other."""
     figure = new_figure(6.0)
     rooms = figure.subplot_mosaic('ac;bc', width_ratios=(2.0, 1.0))
-    t, v, y = (run.column(name) for name in ('t', 'v', 'y'))
-    for axes, (x, values, name) in zip(
-        rooms.values(), ((t, v, 'v'), (v, y, 'y'), (t, y, 'y')), strict=True,
-    ):
-        curve(axes, x, values, HUES[name], width=0.9)
-        label(axes, y=name, x='v' if x is v else TIME_LABEL)
+    for room, x, y in (('a', 't', 'v'), ('b', 't', 'y'), ('c', 'v', 'y')):
+        curve(rooms[room], run.column(x), run.column(y), HUES[y], width=0.9)
+        label(rooms[room], y=y, x='v' if x == 'v' else TIME_LABEL)
     return figure

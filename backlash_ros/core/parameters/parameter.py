@@ -119,7 +119,7 @@ def check_value(parameter: Parameter, value: object) -> Value:
     if isinstance(default, tuple):
         return list_of_names(parameter, value) if parameter.names else _numbers(parameter, value)
     number = _number(parameter, value)
-    if not isinstance(default, int):
+    if isinstance(default, float):
         return number
     if number != int(number):
         raise refused(value, 'must be a whole number')
@@ -152,7 +152,7 @@ def list_of_names(parameter: Parameter, value: object) -> tuple[str, ...]:
 def _numbers(parameter: Parameter, value: object) -> tuple[float, ...]:
     elements = _elements(parameter, value, 'numbers')
     numbers = tuple(_number(parameter, element) for element in elements)
-    if parameter.length is not None and len(numbers) != parameter.length:
+    if len(numbers) != (parameter.length or len(numbers)):
         raise ParameterError(parameter.name, elements, f'must have {parameter.length} numbers')
     if not numbers and parameter.default != ():
         raise ParameterError(parameter.name, [], 'must have at least one number')

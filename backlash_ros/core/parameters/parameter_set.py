@@ -41,7 +41,14 @@ class Parameters(ParameterTree, Mapping[str, Value]):
         """Take given values and the defaults of all others; raises ParameterError."""
         given = dict(values or {})
         joints = list_of_names(BY_NAME['joints'], given.get('joints', ()))
-        shared, own = split(given, joints)
+        own: dict[str, dict[str, object]] = {joint: {} for joint in joints}
+        shared: dict[str, object] = {}
+        for name, value in given.items():
+            first, _, rest = name.partition('.')
+            if rest and first in own:
+                own[first][rest] = value
+            else:
+                shared[name] = value
         for joint in joints:
             if any(name.partition('.')[0] == joint for name in BY_NAME):
                 raise ParameterError(
@@ -96,21 +103,6 @@ def check_names(names: Iterable[str], joints: Iterable[str] = ()) -> None:
             valid = [*BY_NAME, *(f'{joint}.{own}' for joint in joints for own in BY_NAME)]
             near = difflib.get_close_matches(name, valid, n=1, cutoff=0.0)[0]
             raise ParameterError(name, UNTOLD, 'is not a parameter', f'did you mean {near}?')
-
-
-def split(
-    given: Mapping[str, object], joints: Iterable[str],
-) -> tuple[dict[str, object], dict[str, dict[str, object]]]:
-    """What all share, and what each joint has of its own, given as `<joint>.<name>`."""
-    shared: dict[str, object] = {}
-    own: dict[str, dict[str, object]] = {joint: {} for joint in joints}
-    for name, value in given.items():
-        first, _, rest = name.partition('.')
-        if rest and first in own:
-            own[first][rest] = value
-        else:
-            shared[name] = value
-    return shared, own
 
 
 def entry_of(name: str) -> Parameter | None:

@@ -74,9 +74,8 @@ class EstimatorOptions:
     initial: InitialEstimate = InitialEstimate()
     bounds: EstimateBounds = EstimateBounds()
     output_noise_std: float = option(
-        1e-05, 'standard deviation of the noise on y; where it is not given, that of the '
-        'simulated noise and quantum if there is any; not live for every law', 'y', low=0.0,
-        live=True)
+        1e-05, 'standard deviation of the noise on y; where it is not given, that of the simulated '
+        'noise and quantum if there is any; not live for every law', 'y', low=0.0, live=True)
     input_noise_std: float = option(
         0.0, 'moving_horizon: random walk of a slow disturbance of u per square root of a second; '
         '0: learned where the data demand one', 'u', low=0.0, live=True)
@@ -122,9 +121,8 @@ class TrackingWeights:
         'reference, in units of |G|^2 at a twentieth of the sampling rate', low=0.0, above=True,
         live=True)
     integral_weight: float = option(
-        0.0, 'tracking: weight of the squared integral of y_m - y; 0, for none, suffices where '
-        'the law learns, as effective crossings take up a constant disturbance', low=0.0,
-        live=True)
+        0.0, 'tracking: weight of the squared integral of y_m - y; 0, for none, suffices where the '
+        'law learns, as effective crossings take up a constant disturbance', low=0.0, live=True)
 
 
 @dataclass(frozen=True)
@@ -172,8 +170,7 @@ class Timeouts:
         0.5, 'longest silence of plant_output before on_timeout is done, 0 for never')
     reference: float = silence(
         1.0, 'longest silence of reference before it is reported, 0 for never')
-    ramp: float = silence(
-        0.5, 'longest ramp at the end; a v that is not at zero by then is held')
+    ramp: float = silence(0.5, 'longest ramp at the end; a v that is not at zero by then is held')
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import os
 import socket
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
 import backlash_ros
@@ -69,12 +69,13 @@ def free_domain() -> Iterator[int]:
     for i in range(domains):
         domain = 1 + (os.getpid() + i) % domains
         port = 7400 + 250 * domain
-        with ExitStack() as reservation:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as reservation:
             try:
-                reservation.enter_context(_bound(port + 5))
+                reservation.bind(('', port + 5))
                 # As many participants as the discovery range LOCALHOST looks for.
                 for of_participant in range(port + 10, port + 74, 2):
-                    _bound(of_participant).close()
+                    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+                        probe.bind(('', of_participant))
             except OSError:
                 continue
             yield domain
@@ -82,13 +83,3 @@ def free_domain() -> Iterator[int]:
     raise BrokenOffError(
         f'every ROS_DOMAIN_ID from 1 to {domains} is in use on this machine: set one yourself'
     )
-
-
-def _bound(port: int) -> socket.socket:
-    bound = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    try:
-        bound.bind(('', port))
-    except OSError:
-        bound.close()
-        raise
-    return bound

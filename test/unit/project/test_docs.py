@@ -227,5 +227,5 @@ def test_files_that_pages_show_are_valid() -> None:
 def test_readme_names_every_executable_and_topic() -> None:
     codes = set(CODE.findall(README))
     assert console_scripts() <= codes
-    named = {value for name, value in vars(topics).items() if name.isupper()}
+    named = [value for name, value in vars(topics).items() if name.isupper()]
     assert {name for name in named if isinstance(name, str)} <= codes
