@@ -19,9 +19,9 @@ from backlash_ros.options import OptionParser
 from backlash_ros.tools import cli
 from backlash_ros.tools.cli import NOTHING, BrokenOffError, number
 from backlash_ros.tools.config import effective_parameters
-from backlash_ros.tools.runs.figure_data import ErrorCurves, control_error, moving_rms
 from backlash_ros.tools.runs.files import result_directory
 from backlash_ros.tools.runs.read_run import run_loop
+from backlash_ros.tools.runs.summary import ErrorCurves, control_error, moving_rms
 
 COMPARISON_HEADER = (
     'loop', 'control error', 'tracking error', 'backlash penalty', 'total variation of v',

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.simulation.metrics import SETTLING_TOLERANCE
 from backlash_ros.core.simulation.run_record import RunRecord
-from backlash_ros.tools.runs import figure_data
-from backlash_ros.tools.runs.figure_data import Part
+from backlash_ros.tools.runs.summary import ErrorCurves, Part, estimated_loop
 from backlash_ros.topics import BACKLASH
 
 Array = NDArray[np.float64]
@@ -231,7 +230,7 @@ def draw_hysteresis(run: RunRecord, end: Part) -> Figure:
     figure = new_figure(6.0)
     axes = figure.subplots()
     t, v, truth = run.column('t')[end.rows], run.column('v'), run.has_truth
-    u = run.column('u') if truth else figure_data.estimated_loop(run)
+    u = run.column('u') if truth else estimated_loop(run)
     span = np.array(limits([v[end.rows]], margin=0.15))
     for name, side in (('c_r', 'right'), ('c_l', 'left')):
         m, c = run.column('m')[-1], run.column(name)[-1]
@@ -285,7 +284,7 @@ def draw_input(run: RunRecord, parts: Sequence[Part]) -> Figure:
     return figure
 
 
-def draw_error_curves(loops: Sequence[figure_data.ErrorCurves], window_s: float) -> Figure:
+def draw_error_curves(loops: Sequence[ErrorCurves], window_s: float) -> Figure:
     """Size of the control error (Figure 5 of the paper), and of the tracking error if any is known.
 
     window_s: over which the RMS was taken [s].

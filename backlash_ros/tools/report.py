@@ -22,8 +22,17 @@ from backlash_ros.tools.config import write_config
 from backlash_ros.tools.page import Picture, facts, page, table
 from backlash_ros.tools.records.columns import parse_columns
 from backlash_ros.tools.records.reading import read_run_or_log
-from backlash_ros.tools.runs import figure_data, files
-from backlash_ros.tools.runs.summary import ESTIMATE_HEADER, estimate_cells, summarise
+from backlash_ros.tools.runs import files
+from backlash_ros.tools.runs.summary import (
+    ESTIMATE_HEADER,
+    compare_laws,
+    compared_samples,
+    control_error,
+    estimate_cells,
+    followed_reference,
+    interesting_parts,
+    summarise,
+)
 from backlash_ros.topics import BACKLASH
 
 REPORT_PAGE = 'report.html'
@@ -78,7 +87,7 @@ def _figures(
             figures.draw_log(run),
         )
         return
-    start, end = parts = figure_data.interesting_parts(run, parameters)
+    start, end = parts = interesting_parts(run, parameters)
     if run.has_truth:
         yield (
             'parameter_errors.png', 'Parameter errors over time (Figure 4 of the paper)',
@@ -92,7 +101,7 @@ def _figures(
         'the law knows.', figures.draw_estimates(run),
     )
     if np.isfinite(run.column('u')).any():
-        error = figure_data.control_error(run)
+        error = control_error(run)
         yield (
             'control_error.png', 'Control error of this run',
             'e = u − u<sub>d</sub> (3.4): what the inverse leaves of the backlash.',
@@ -105,8 +114,8 @@ def _figures(
             figures.draw_closer(run, run.column('innovation'), r'$y - \hat{y}$ [unit of y]', parts),
         )
     if run.has_truth and parameters is not None:
-        duration = figure_data.compared_samples(run) * run.sample_period
-        curves, window_s, notes = figure_data.compare_laws(run, parameters)
+        duration = compared_samples(run) * run.sample_period
+        curves, window_s, notes = compare_laws(run, parameters)
         yield (
             'laws.png', 'Control error of the laws (Figure 5 of the paper)',
             'This run beside the other laws, simulated with the same parameters, over the first '
@@ -120,7 +129,7 @@ def _figures(
         'The loop as the last estimates see it: u itself was not measured.',
         figures.draw_hysteresis(run, end),
     )
-    y_m, delay, followed = figure_data.followed_reference(run, parameters)
+    y_m, delay, followed = followed_reference(run, parameters)
     yield (
         'output.png', 'Reference and output',
         'y follows y<sub>m</sub>.' if followed else
@@ -190,16 +199,12 @@ def _tables(summary: Mapping[str, Any]) -> str:
 
 def make_parser() -> argparse.ArgumentParser:
     parser = OptionParser('report', description=__doc__)
-    parser.add_argument(
-        'path', type=Path, help='a bag or its .mcap file, a folder of results, samples.csv, or a '
-                                'log as identify reads it'
-    )
+    parser.add_argument('path', type=Path, help='a bag or its .mcap file, a folder of results, '
+                        'samples.csv, or a log as identify reads it')
     parser.add_argument('--columns', type=parse_columns, default={}, metavar='t=…,v=…,y=…',
                         help='which columns of a log these are (default: told by their names)')
-    parser.add_argument(
-        '--config', type=Path, metavar='FILE',
-        help='parameters of the run (default: parameters.yaml beside it)',
-    )
+    parser.add_argument('--config', type=Path, metavar='FILE',
+                        help='parameters of the run (default: parameters.yaml beside it)')
     cli.add_options(parser, '--axis', '--from', '--to', '--out')
     return parser
 

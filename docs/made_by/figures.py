@@ -39,7 +39,7 @@ from backlash_ros.tools.figures import (
     shade,
     zero_line,
 )
-from backlash_ros.tools.runs.figure_data import compare_laws, interesting_parts
+from backlash_ros.tools.runs.summary import compare_laws, interesting_parts
 
 DOCS = Path(__file__).resolve().parents[1]
 IMAGES = DOCS / 'images'

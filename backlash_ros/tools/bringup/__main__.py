@@ -58,30 +58,18 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     cli.add_options(parser, '--config', '--set', '--axis', '--seed', '--out', '--duration')
-    parser.add_argument(
-        '--driver', metavar='COMMAND',
-        help='start this command instead of the simulated plant; none: it is started elsewhere',
-    )
-    parser.add_argument(
-        '--unlimited', action='store_true',
-        help='let a driver run without control.min, control.max and control.rate_max',
-    )
-    parser.add_argument(
-        '--lockstep', action='store_true',
-        help='as fast as the machine allows, every sample waiting for its control, '
-             'instead of real time',
-    )
-    parser.add_argument(
-        '--record', action=argparse.BooleanOptionalAction, default=True,
-        help='record a bag and write a report from it',
-    )
-    parser.add_argument(
-        '--live', action='store_true',
-        help='show the loop on a page in the browser; its address is printed',
-    )
-    parser.add_argument(
-        '--live-port', type=int, metavar='PORT', help='the same on this port (default: a free one)',
-    )
+    parser.add_argument('--driver', metavar='COMMAND', help='start this command instead of the '
+                        'simulated plant; none: it is started elsewhere')
+    parser.add_argument('--unlimited', action='store_true', help='let a driver run without '
+                        'control.min, control.max and control.rate_max')
+    parser.add_argument('--lockstep', action='store_true', help='as fast as the machine allows, '
+                        'every sample waiting for its control, instead of real time')
+    parser.add_argument('--record', action=argparse.BooleanOptionalAction, default=True,
+                        help='record a bag and write a report from it')
+    parser.add_argument('--live', action='store_true',
+                        help='show the loop on a page in the browser; its address is printed')
+    parser.add_argument('--live-port', type=int, metavar='PORT',
+                        help='the same on this port (default: a free one)')
     return parser.parse_args(arguments)
 
 

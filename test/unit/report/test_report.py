@@ -19,11 +19,15 @@ from backlash_ros.tools import figures
 from backlash_ros.tools import report as report
 from backlash_ros.tools.cli import InputError
 from backlash_ros.tools.config import write_config
-from backlash_ros.tools.runs import figure_data
 from backlash_ros.tools.runs.bag import read_bag
 from backlash_ros.tools.runs.files import Run, write_run
 from backlash_ros.tools.runs.read_run import read_run
-from backlash_ros.tools.runs.summary import summarise
+from backlash_ros.tools.runs.summary import (
+    compare_laws,
+    followed_reference,
+    moving_rms,
+    summarise,
+)
 
 
 @pytest.fixture(scope='module')
@@ -177,11 +181,11 @@ def test_run_of_one_sample_has_a_report(tmp_path: Path) -> None:
 def test_output_is_compared_with_the_reference_as_late_as_the_structure_makes_it() -> None:
     tracking = Parameters({'structure': 'tracking', 'amplitude': 0.2, 'tracking.preview': 60})
     run = build_closed_loop(tracking).run(300)
-    y_m, delay, followed = figure_data.followed_reference(run, tracking)
+    y_m, delay, followed = followed_reference(run, tracking)
     assert delay == pytest.approx(0.6)
     np.testing.assert_array_equal(y_m[60:], run.column('y_m')[:-60])
     assert followed
-    assert not figure_data.followed_reference(run, None)[2]
+    assert not followed_reference(run, None)[2]
     late, prompt = (summarise(run, known)['tracking_error_rms'] for known in (tracking, None))
     assert late < 0.5 < prompt
 
@@ -190,12 +194,12 @@ def test_moving_rms_is_that_of_the_newest_samples() -> None:
     values = np.array([3.0, nan, 4.0, 1e-9, 0.0, 1e-9])
     small = 1e-9 / np.sqrt(2)
     expected = [3.0, 3.0, 4.0, np.sqrt(8.0), small, small]
-    np.testing.assert_allclose(figure_data.moving_rms(values, 2), expected, rtol=1e-9)
+    np.testing.assert_allclose(moving_rms(values, 2), expected, rtol=1e-9)
 
 
 def test_law_that_breaks_off_does_not_take_the_report_with_it(run: RunRecord) -> None:
     other = PARAMETERS.replaced({'waveform': 'file', 'file': 'gone.csv'})
-    curves, _, notes = figure_data.compare_laws(run, other)
+    curves, _, notes = compare_laws(run, other)
     assert [len(curve.t) for curve in curves] == [run.samples]
     assert notes
     assert all('gone.csv' in note for note in notes)
