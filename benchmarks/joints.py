@@ -141,7 +141,7 @@ def measure(together: bool, law: str, rate: float, seconds: float) -> list[str]:
     period_s, samples = 1.0 / rate, round(rate * seconds)
     begin = time.perf_counter()
     with processes(commands(together, law, period_s)) as (supervisor, domain):
-        waited = {child.plan.name for child in supervisor.children}
+        waited = {child.name for child in supervisor.children}
         while waited:
             wait_for_event(
                 supervisor, lambda kind, who: kind == 'ready' and waited.discard(who) is None
@@ -230,7 +230,7 @@ def soak(seconds: float, rate: float) -> str:
                 supervisor.stop()
             finally:
                 watch.close()
-            logs = {child.plan.name: child.plan.log.read_text() for child in supervisor.children}
+            logs = {child.name: child.log.read_text() for child in supervisor.children}
     found = re.search(r'(\d+) cycles, (\d+) of them lost', logs['driver'])
     if found is None:
         raise RuntimeError(logs['driver'])

@@ -84,7 +84,7 @@ def measure_costs(
         try:
             first_s = driver.wait_for_command() - began
             driver.run(round(WARM_UP_S * rate))
-            pids = {child.plan.name: child.process.pid for child in supervisor.children}
+            pids = {child.name: child.process.pid for child in supervisor.children}
             samples = round(duration_s * rate)
             before, began = {name: processor_s(pid) for name, pid in pids.items()}, time.time()
             driver.run(samples)

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from backlash_ros.tools.bringup.environment import child_environment, free_domain
-from backlash_ros.tools.bringup.supervisor import ProcessPlan, ProcessSupervisor
+from backlash_ros.tools.bringup.supervisor import Child, ProcessSupervisor
 
 DEADLINE_S = 30.0  # for processes to start
 NODES = 'backlash_ros.nodes'
@@ -35,7 +35,7 @@ def processes_in(
         folder = Path(name)
         environment = child_environment(folder, domain)
         stages = [
-            [ProcessPlan(who, tuple(command), folder / f'{who}.log', environment,
+            [Child(who, tuple(command), folder / f'{who}.log', environment,
                          foreign='-m' not in command)]  # no node of the package
             for who, command in commands.items()
         ]
@@ -59,8 +59,8 @@ def wait_for_event(
     """Time at which an event of this kind and process came [s]."""
     deadline = time.monotonic() + patience_s
     while time.monotonic() < deadline:
-        for plan, event in supervisor.events(0.1):
-            if wanted(event['event'], plan.name):
+        for child, event in supervisor.events(0.1):
+            if wanted(event['event'], child.name):
                 return time.perf_counter()
         check_running(supervisor)
     raise RuntimeError('the nodes did not come to an end in time')
@@ -70,4 +70,4 @@ def check_running(supervisor: ProcessSupervisor) -> None:
     """Raise RuntimeError if a process has ended."""
     for child in supervisor.children:
         if child.has_ended:
-            raise RuntimeError(f'{child.plan.name} ended: {child.end_of_log()}')
+            raise RuntimeError(f'{child.name} ended: {child.end_of_log()}')

@@ -35,13 +35,13 @@ def soak_checks(seconds: float) -> list[Check]:
     with processes(commands) as (supervisor, _):
         wait_for_event(supervisor, lambda kind, who: (kind, who) == ('ready', 'plant'))
         time.sleep(WARM_UP * seconds)
-        controller = next(c for c in supervisor.children if c.plan.name == 'controller')
+        controller = next(c for c in supervisor.children if c.name == 'controller')
         before = resident_mb(controller.process.pid)
         time.sleep((1.0 - WARM_UP) * seconds - 1.0)
         growth = resident_mb(controller.process.pid) - before
         wait_for_event(supervisor, lambda kind, _: kind == 'done', 2.0 * seconds)
         supervisor.stop()
-        said = controller.plan.log.read_text().strip().splitlines()[-1]
+        said = controller.log.read_text().strip().splitlines()[-1]
     counts = dict(re.findall(r'([a-z][a-z ]*): (\d+)', said))
     lost, unsent = (int(counts.get(name, 0)) for name in ('lost', 'of these never sent'))
     return [

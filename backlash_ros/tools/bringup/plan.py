@@ -16,7 +16,7 @@ from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.middleware.installed import ROS_MISSING, ros_is_missing
 from backlash_ros.options import LARGEST_PORT
 from backlash_ros.tools.bringup.environment import child_environment, foreign_environment
-from backlash_ros.tools.bringup.supervisor import ProcessPlan
+from backlash_ros.tools.bringup.supervisor import Child
 from backlash_ros.tools.cli import BrokenOffError, InputError, number_of_samples, print_warnings
 from backlash_ros.tools.config import read_configuration, write_config
 from backlash_ros.tools.runs.files import CONFIG_FILE, result_directory
@@ -161,7 +161,7 @@ def _checked(p: Parameters, axis: str, options: argparse.Namespace) -> Parameter
     return p
 
 
-def plan_processes(plan: RunPlan, domain: int | None) -> list[list[ProcessPlan]]:
+def plan_processes(plan: RunPlan, domain: int | None) -> list[list[Child]]:
     """The processes of a run by stages, which are to be stopped one after the other.
 
     A simulated plant stops first, so that no output stays without its answer. With a driver the
@@ -169,7 +169,7 @@ def plan_processes(plan: RunPlan, domain: int | None) -> list[list[ProcessPlan]]
     has everything that the others have said. The references of joints come from whoever plans
     their motion. domain: ROS_DOMAIN_ID to set, None to leave it alone.
     """
-    stages: list[list[ProcessPlan]] = [[], [], [], []]
+    stages: list[list[Child]] = [[], [], [], []]
     served: dict[str, list[AxisPlan]] = {}
     for axis in plan.axes:
         p = axis.parameters
@@ -185,7 +185,7 @@ def plan_processes(plan: RunPlan, domain: int | None) -> list[list[ProcessPlan]]
     if plan.live_port is not None:
         first = plan.axes[0]
         shown = [f'/{axis.name}' if axis.name else '/controller' for axis in plan.axes]
-        stages[-1].append(ProcessPlan(
+        stages[-1].append(Child(
             'live', (*_module('live'), '--port', str(plan.live_port), *shown),
             first.logs / 'live.log', child_environment(first.logs, domain), first.name,
             spectator=True,
@@ -197,7 +197,7 @@ def _module(name: str) -> tuple[str, ...]:
     return sys.executable, '-m', f'backlash_ros.nodes.{name}'
 
 
-def _node(axis: AxisPlan, node: str, domain: int | None) -> ProcessPlan:
+def _node(axis: AxisPlan, node: str, domain: int | None) -> Child:
     lockstep = axis.parameters.lockstep
     if node == 'recorder':
         # In YAML, whatever stands in the path.
@@ -211,7 +211,7 @@ def _node(axis: AxisPlan, node: str, domain: int | None) -> ProcessPlan:
         settings += ['-r', f'__ns:=/{axis.name}']
         if lockstep:
             settings += ['-r', '/clock:=clock']  # each axis has a time of its own
-    return ProcessPlan(
+    return Child(
         axis.process_name(node),
         (*_module(node), '--ros-args', '--params-file', str(axis.out / CONFIG_FILE), *settings),
         axis.logs / f'{node}.log', child_environment(axis.logs, domain), axis.name,
@@ -222,7 +222,7 @@ def _node(axis: AxisPlan, node: str, domain: int | None) -> ProcessPlan:
 
 def _driver(
     plan: RunPlan, command: str, axes: Sequence[AxisPlan], domain: int | None,
-) -> ProcessPlan:
+) -> Child:
     name, log = axes[0].process_name('driver'), axes[0].logs / 'driver.log'
     if len(axes) > 1:
         names = [axis.name for axis in axes]
@@ -231,6 +231,6 @@ def _driver(
     # The last command of the controller acts from the next sample of the driver on.
     settle_s = min(2.0 * max(axis.parameters.sample_period for axis in axes), 1.0)
     environment = foreign_environment(child_environment(log.parent, domain))
-    return ProcessPlan(
+    return Child(
         name, tuple(shlex.split(command)), log, environment, foreign=True, settle_s=settle_s
     )

@@ -18,7 +18,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -29,14 +29,15 @@ from backlash_ros.tools.cli import BrokenOffError
 ESCALATION = ((signal.SIGINT, 10.0), (signal.SIGTERM, 3.0), (signal.SIGKILL, 3.0))
 
 
-@dataclass(frozen=True)
-class ProcessPlan:
-    """What to start.
+@dataclass(eq=False)
+class Child:
+    """A process, from plan to end.
 
     name: in messages. axis: that its events are about. foreign: no node of this package: all that
     it prints goes to its log, and signals reach it from the very start. spectator: the run goes on
     without it. settle_s: time that passes before it is stopped, in which what was stopped before
     still has an effect on it. grace_s: time that it needs for its end beyond what any process gets.
+    process: once it has started.
     """
 
     name: str
@@ -48,26 +49,24 @@ class ProcessPlan:
     spectator: bool = False
     settle_s: float = 0.0
     grace_s: float = 0.0
+    process: subprocess.Popen[bytes] = field(init=False)
+    unfinished: bytes = field(default=b'', init=False)  # of a line
 
-
-class Child:
-    """A started process. Raises BrokenOffError for a program that cannot be started."""
-
-    def __init__(self, plan: ProcessPlan) -> None:
-        self.plan, self._unfinished = plan, b''
+    def start(self) -> None:
+        """Raises BrokenOffError for a program that cannot be started."""
         # A node lets them through when it knows what to do with them: see nodes/__init__.py.
-        held_back = () if plan.foreign else (signal.SIGINT, signal.SIGTERM)
+        held_back = () if self.foreign else (signal.SIGINT, signal.SIGTERM)
         before = signal.pthread_sigmask(signal.SIG_BLOCK, held_back)
         try:
-            with plan.log.open('ab') as log:
+            with self.log.open('ab') as log:
                 self.process = subprocess.Popen(
-                    plan.command, stdin=subprocess.DEVNULL,
-                    stdout=log if plan.foreign else subprocess.PIPE, stderr=log,
-                    env=plan.environment, start_new_session=True,
+                    self.command, stdin=subprocess.DEVNULL,
+                    stdout=log if self.foreign else subprocess.PIPE, stderr=log,
+                    env=self.environment, start_new_session=True,
                 )
         except OSError as error:
             raise BrokenOffError(
-                f'{plan.name} does not start: {plan.command[0]}: {error.strerror}'
+                f'{self.name} does not start: {self.command[0]}: {error.strerror}'
             ) from error
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
@@ -78,7 +77,7 @@ class Child:
 
     def events(self, chunk: bytes) -> list[dict[str, Any]]:
         """JSON objects with `event` in the lines that end in this chunk; all else is logged."""
-        *lines, self._unfinished = (self._unfinished + chunk).split(b'\n')
+        *lines, self.unfinished = (self.unfinished + chunk).split(b'\n')
         found = []
         for line in lines:
             with contextlib.suppress(ValueError):
@@ -86,7 +85,7 @@ class Child:
                 if isinstance(content, dict) and 'event' in content:
                     found.append(content)
                     continue
-            with self.plan.log.open('ab') as log:
+            with self.log.open('ab') as log:
                 log.write(line + b'\n')
         return found
 
@@ -95,13 +94,13 @@ class Child:
         code, end = self.process.returncode, f'exit code {self.process.returncode}'
         if code is not None and code < 0:
             end = f'killed by {signal.Signals(-code).name}'
-        return f'{self.plan.name} {what} ({end}){further}, the end of {self.end_of_log()}'
+        return f'{self.name} {what} ({end}){further}, the end of {self.end_of_log()}'
 
     def end_of_log(self) -> str:
         """The last ten lines of the log, indented."""
-        lines = self.plan.log.read_text(encoding='utf-8', errors='replace').splitlines()
+        lines = self.log.read_text(encoding='utf-8', errors='replace').splitlines()
         quoted = ''.join(f'\n    {line}' for line in lines[-10:])
-        return f'{self.plan.log}:{quoted}' if quoted else f'{self.plan.log} is empty'
+        return f'{self.log}:{quoted}' if quoted else f'{self.log} is empty'
 
 
 class ProcessSupervisor:
@@ -112,9 +111,9 @@ class ProcessSupervisor:
     """
 
     def __init__(
-        self, stages: Sequence[Sequence[ProcessPlan]], hurry: Callable[[], bool],
+        self, stages: Sequence[Sequence[Child]], hurry: Callable[[], bool],
     ) -> None:
-        self._plans, self._hurry = stages, hurry
+        self._planned, self._hurry = stages, hurry
         self._stages: list[list[Child]] = [[] for _ in stages]
         self._selector = selectors.DefaultSelector()
 
@@ -125,9 +124,10 @@ class ProcessSupervisor:
             start_new_session=True,
         )
         try:
-            for children, plans in zip(self._stages, self._plans, strict=True):
-                for plan in plans:
-                    children.append(child := Child(plan))
+            for started, planned in zip(self._stages, self._planned, strict=True):
+                for child in planned:
+                    child.start()
+                    started.append(child)
                     self._tell_guardian(list(map(_groups, self._stages)))
                     if child.process.stdout is not None:
                         self._selector.register(child.process.stdout, selectors.EVENT_READ, child)
@@ -151,25 +151,25 @@ class ProcessSupervisor:
     def children(self) -> list[Child]:
         return [child for stage in self._stages for child in stage]
 
-    def events(self, timeout: float) -> list[tuple[ProcessPlan, dict[str, Any]]]:
+    def events(self, timeout: float) -> list[tuple[Child, dict[str, Any]]]:
         """What the processes have said; waits up to timeout [s] for a first word."""
         found = []
         for key, _ in self._selector.select(timeout):
             chunk = os.read(key.fd, 65536)
             if not chunk:
                 self._selector.unregister(key.fileobj)
-            found += [(key.data.plan, content) for content in key.data.events(chunk)]
+            found += [(key.data, content) for content in key.data.events(chunk)]
         return found
 
-    def stop(self) -> list[tuple[ProcessPlan, dict[str, Any]]]:
+    def stop(self) -> list[tuple[Child, dict[str, Any]]]:
         """Stop one stage after the other, each child with all its group; returns last words."""
-        last_words: list[tuple[ProcessPlan, dict[str, Any]]] = []
+        last_words: list[tuple[Child, dict[str, Any]]] = []
 
         def listen() -> None:
             last_words.extend(self.events(0.02))
 
         for children in self._stages:
-            settle_s = max((c.plan.settle_s for c in children if not c.has_ended), default=0.0)
+            settle_s = max((c.settle_s for c in children if not c.has_ended), default=0.0)
             settled = time.monotonic() + settle_s
             while time.monotonic() < settled and not self._hurry():
                 listen()
@@ -189,7 +189,7 @@ class ProcessSupervisor:
 
 def _groups(children: Sequence[Child]) -> tuple[list[int], float]:
     """Process groups of a stage, and the longest time that one of them needs beyond the usual."""
-    grace_s = max((child.plan.grace_s for child in children), default=0.0)
+    grace_s = max((child.grace_s for child in children), default=0.0)
     return [child.process.pid for child in children], grace_s
 
 

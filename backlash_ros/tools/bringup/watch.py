@@ -12,7 +12,7 @@ from typing import Any
 
 from backlash_ros import topics
 from backlash_ros.tools.bringup.plan import ELSEWHERE, AxisPlan, RunPlan
-from backlash_ros.tools.bringup.supervisor import Child, ProcessPlan, ProcessSupervisor
+from backlash_ros.tools.bringup.supervisor import Child, ProcessSupervisor
 from backlash_ros.tools.cli import BrokenOffError, StopRequests, number
 
 READY_DEADLINE_S = 30.0  # for the start of every process
@@ -155,8 +155,8 @@ class RunWatch:
             # Said before the processes are stopped, which may take a while.
             self.failure = str(error)
             complain(self.failure)
-        for plan, content in self._supervisor.stop():
-            self._note(plan, content)
+        for child, content in self._supervisor.stop():
+            self._note(child, content)
         if not self.failure:
             self._judge_exits()
 
@@ -172,14 +172,14 @@ class RunWatch:
 
         def missing() -> list[Child]:
             return [child for child in self._supervisor.children
-                    if not child.plan.foreign and child.plan.name not in self._ready]
+                    if not child.foreign and child.name not in self._ready]
 
         while missing():
             self._listen()
             late = [child for child in missing()
-                    if child.plan.name not in self.axes[child.plan.axis].plan.waiting]
+                    if child.name not in self.axes[child.axis].plan.waiting]
             if late and time.monotonic() > deadline:
-                names = ', '.join(child.plan.name for child in late)
+                names = ', '.join(child.name for child in late)
                 hint = ' (a controller waits until the driver subscribes to its command)' \
                     if any(axis.plan.parameters.driver for axis in self.axes.values()) else ''
                 logs = '\n'.join(f'the end of {child.end_of_log()}' for child in late)
@@ -204,16 +204,16 @@ class RunWatch:
                 ))
 
     def _listen(self) -> None:
-        for plan, content in self._supervisor.events(0.1):
-            self._note(plan, content)
+        for child, content in self._supervisor.events(0.1):
+            self._note(child, content)
         if self._requests.count and not self._over:
             raise BrokenOffError(f'interrupted by {self._requests.last}, stopping')
         dead = []
         for child in self._supervisor.children:
-            name = child.plan.name
+            name = child.name
             if not child.has_ended or name in self._gone:
                 continue
-            if child.plan.spectator and name in self._ready:
+            if child.spectator and name in self._ready:
                 self._gone.add(name)
                 complain(child.describe_end('died', ', the run goes on without it'))
             else:
@@ -221,12 +221,12 @@ class RunWatch:
         if dead:
             raise BrokenOffError('\n'.join(dead))
 
-    def _note(self, plan: ProcessPlan, content: Mapping[str, Any]) -> None:
-        axis, kind = self.axes[plan.axis], content['event']
+    def _note(self, child: Child, content: Mapping[str, Any]) -> None:
+        axis, kind = self.axes[child.axis], content['event']
         if kind == 'ready':
-            self._ready.add(plan.name)
+            self._ready.add(child.name)
             if 'address' in content:
-                print(f'{plan.name}: {content["address"]}', flush=True)
+                print(f'{child.name}: {content["address"]}', flush=True)
         elif kind == 'done':
             axis.published = content['published']
         elif kind == 'progress':
@@ -250,9 +250,9 @@ class RunWatch:
         stopped = -signal.SIGINT, -signal.SIGTERM, 128 + signal.SIGINT, 128 + signal.SIGTERM
         for child in self._supervisor.children:
             code = child.process.returncode
-            if code == 0 or child.plan.name in self._gone:
+            if code == 0 or child.name in self._gone:
                 continue
-            if not child.plan.foreign or code == -signal.SIGKILL:
+            if not child.foreign or code == -signal.SIGKILL:
                 self.failure = child.describe_end('did not stop cleanly')
                 complain(self.failure)
             elif code not in stopped:

@@ -185,27 +185,24 @@ def _find_tables(
         if not axis and joints[1:]:
             notes = [f'this is joint {joint}; --axis chooses one of {", ".join(joints[1:])}']
         prefix, axis = f'{joint}.', ''
-    tables: list[Table] = []
-    begin_ns = first[0][0] if first else 0
-    for topic in (topics.SIGNALS, topics.ESTIMATES, topics.TRUTH):
+    begin_ns, found = 0, {}
+    for topic in topics.LABELS_OF:  # signals first
         name, note = choose_namespace(_names_of(content, topic), axis)
-        if topic == topics.SIGNALS and note:
-            notes.append(note)
-            axis = name.strip('/').split('/')[0]
-        if name:
-            begin_ns = content.messages[name][0][0] if topic == topics.SIGNALS else begin_ns
-            tables.append(_tabulate(topic, name, content.messages[name], prefix, begin_ns))
-        elif topic == topics.TRUTH:  # which a real plant does not know
-            tables.append({label: np.empty(0) for label in (*topics.TRUTH_LABELS, 'stamp')})
-        else:
+        found[topic] = content.messages.get(name, [])
+        if topic == topics.SIGNALS and name:
+            begin_ns = found[topic][0][0]
+            if note:
+                notes.append(note)
+                axis = name.strip('/').split('/')[0]
+        if not name and topic in (topics.SIGNALS, topics.ESTIMATES):
             of_axis = f' of axis {axis}' if axis else ''
             raise InputError(f'holds no message of {topic}{of_axis}; its topics are '
                              f'{", ".join(sorted(content.names)) or "none"}')
-    models = content.messages.get(choose_namespace(_names_of(content, topics.MODEL), axis)[0], ())
-    fields = [(float(stamp - begin_ns), _fields_of(message, prefix)) for stamp, message in models]
+    models = [(float(stamp - begin_ns), _fields_of(message, prefix))
+              for stamp, message in found.pop(topics.MODEL)]
     # Of a joint that was not answered there is nothing but nan.
-    known = [each for each in fields if not all(map(isnan, chain(*each[1].values())))]
-    return tables, known, notes
+    known = [each for each in models if not all(map(isnan, chain(*each[1].values())))]
+    return [_tabulate(*each, prefix, begin_ns) for each in found.items()], known, notes
 
 
 def _labels(message: Any) -> list[str]:
@@ -222,17 +219,19 @@ def _names_of(content: Content, topic: str) -> list[str]:
 
 
 def _tabulate(
-    topic: str, name: str, messages: Sequence[tuple[int, Any]], prefix: str, begin_ns: int,
+    topic: str, messages: Sequence[tuple[int, Any]], prefix: str, begin_ns: int,
 ) -> Table:
     """The messages of a topic, of several joints what is about the one with this prefix."""
+    if not messages:  # a real plant does not know its truth
+        return {label: np.empty(0) for label in (*topics.LABELS_OF[topic], 'stamp')}
     given = _labels(messages[0][1]) or topics.LABELS_OF[topic]
     if any(len(message.data) != len(given) for _, message in messages):
-        raise InputError(f'{name} has a message without a value for each label')
+        raise InputError(f'{topic} has a message without a value for each label')
     values = np.array([message.data for _, message in messages], dtype=np.float64).T
     table = {label.removeprefix(prefix): column for label, column in zip(given, values, strict=True)
              if label.startswith(prefix)}
     if missing := sorted(set(topics.LABELS_OF[topic]) - set(table)):
-        raise InputError(f'{name} lacks {", ".join(missing)}')
+        raise InputError(f'{topic} lacks {", ".join(missing)}')
     # A joint that was not answered has a row of nan.
     answered = ~np.isnan(list(table.values())).all(axis=0)
     table['stamp'] = np.array([stamp - begin_ns for stamp, _ in messages], dtype=np.float64)

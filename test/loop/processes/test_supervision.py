@@ -15,7 +15,7 @@ from backlash_ros.tools.bringup import supervisor as supervising
 from backlash_ros.tools.bringup import watch as watching
 from backlash_ros.tools.bringup.environment import child_environment
 from backlash_ros.tools.bringup.plan import AxisPlan, RunPlan
-from backlash_ros.tools.bringup.supervisor import ProcessPlan, ProcessSupervisor
+from backlash_ros.tools.bringup.supervisor import Child, ProcessSupervisor
 from backlash_ros.tools.cli import StopRequests
 from backlash_ros.tools.config import effective_parameters
 
@@ -57,7 +57,7 @@ def watch(
         axis = AxisPlan('', parameters, tmp_path, record=False)
         axis.logs.mkdir()
         stages = [
-            [ProcessPlan(
+            [Child(
                 name, (sys.executable, '-c', program), axis.logs / f'{name}.log',
                 child_environment(axis.logs, None), foreign=name == 'driver',
             )] for name, program in programs.items()
@@ -107,7 +107,7 @@ def test_stages_end_one_after_the_other_each_with_the_time_that_it_needs(tmp_pat
     after = f'{READY}; {begun(files[1])} {WAIT}; import os; print(os.path.exists({str(gone)!r}))'
     deaf = f'{DEAF}{begun(files[2])}time.sleep(600)'
     stages = [
-        [ProcessPlan(
+        [Child(
             str(i), (sys.executable, '-c', program), tmp_path / f'{i}.log',
             child_environment(tmp_path, None), foreign=True, grace_s=DEADLINE_S * (i < 2),
         )] for i, program in enumerate((patient, after, deaf))

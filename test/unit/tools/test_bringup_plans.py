@@ -12,7 +12,7 @@ from places import ROOT
 from backlash_ros.tools.bringup import __main__ as bringup
 from backlash_ros.tools.bringup.environment import child_environment, foreign_environment
 from backlash_ros.tools.bringup.plan import AxisPlan, RunPlan, plan_processes, prepare
-from backlash_ros.tools.bringup.supervisor import ProcessPlan
+from backlash_ros.tools.bringup.supervisor import Child
 from backlash_ros.tools.bringup.watch import describe
 from backlash_ros.tools.config import effective_parameters
 
@@ -103,7 +103,7 @@ def plan(folder: Path, driver: str, *names: str, **values: object) -> RunPlan:
     ), folder)
 
 
-def names_of(stages: list[list[ProcessPlan]]) -> list[list[str]]:
+def names_of(stages: list[list[Child]]) -> list[list[str]]:
     return [[process.name for process in stage] for stage in stages]
 
 
