@@ -25,9 +25,6 @@ from backlash_ros.nodes.runtime.process import ProcessNode
 from backlash_ros.options import OptionParser
 from backlash_ros.topics import BACKLASH
 
-# By which a controller is known, or a joint of it.
-WATCHED = re.compile(rf'(?P<node>.*)/watch/((?P<joint>[^/]+)/)?{BACKLASH[0]}')
-
 
 @dataclass
 class ControllerState:
@@ -163,7 +160,8 @@ class FollowedControllers:
     def _look(self) -> None:
         """Whoever publishes what a controller publishes is one."""
         for topic, _ in sorted(self._node.get_topic_names_and_types()):
-            found = WATCHED.fullmatch(topic)
+            # By this a controller is known, or a joint of it.
+            found = re.fullmatch(rf'(?P<node>.*)/watch/((?P<joint>[^/]+)/)?{BACKLASH[0]}', topic)
             if found is None or not self._is_wanted(found['node']):
                 continue
             state = ControllerState(found['node'], found['joint'] or '')

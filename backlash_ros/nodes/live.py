@@ -31,7 +31,7 @@ from backlash_ros.nodes.runtime.process import ENABLED, ProcessNode, emit, ros_a
 from backlash_ros.options import LARGEST_PORT
 from backlash_ros.topics import BACKLASH
 
-LIVE, HOST = 'live', '127.0.0.1'
+HOST = '127.0.0.1'
 SHOWN_S, PAGE_PERIOD_S = 10.0, 0.1  # width of the curves, time between two looks
 LIVE_LABELS = (
     *BACKLASH, *(f'{name}_{end}' for name in BACKLASH for end in ('low', 'high')),
@@ -116,7 +116,7 @@ class LiveNode(ProcessNode):
     """
 
     def __init__(self, wanted: Sequence[str], server: PageServer) -> None:
-        super().__init__(LIVE)
+        super().__init__('live')
         # A machine that is held up for a second loses no point.
         self._followed = FollowedControllers(self, wanted, LIVE_LABELS, depth=30)
         self._server = server
@@ -174,7 +174,7 @@ def content_of(state: ControllerState, now_s: float) -> dict[str, object]:
 def main(args: list[str] | None = None) -> int:
     arguments = sys.argv[1:] if args is None else args
     parser = viewer_options(
-        LIVE, __doc__,
+        'live', __doc__,
         'From elsewhere: ssh -L PORT:127.0.0.1:PORT HOST, then open the same address there.',
     )
     parser.add_argument('--port', type=int, default=0, metavar='PORT',
@@ -188,7 +188,7 @@ def main(args: list[str] | None = None) -> int:
         parser.error(f'--port={options.port}: {error.strerror}: choose another one, or none')
     give_way()
     with server:
-        return run(LIVE, lambda: LiveNode(options.name, server), ros_arguments(arguments))
+        return run('live', lambda: LiveNode(options.name, server), ros_arguments(arguments))
 
 
 if __name__ == '__main__':

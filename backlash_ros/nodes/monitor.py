@@ -36,7 +36,6 @@ from backlash_ros.nodes.runtime.executor import PromptExecutor
 from backlash_ros.nodes.runtime.process import ProcessNode, ros_arguments, run
 from backlash_ros.topics import BACKLASH
 
-MONITOR = 'monitor'
 SCREEN_PERIOD_S = 0.2
 ANSWER_S = 2.0  # longest wait for a service, and for its answer
 NOTICE_S = 3.0  # for which a notice is shown, and a second r resets
@@ -49,7 +48,7 @@ ACTIONS = {
 }
 
 # Sure, within the band, beyond it.
-BAR, ASCII_BAR = '█▒·', '#=.'
+BAR = '█▒·'
 
 
 class MonitorNode(ProcessNode):
@@ -59,7 +58,7 @@ class MonitorNode(ProcessNode):
     """
 
     def __init__(self, wanted: Sequence[str]) -> None:
-        super().__init__(MONITOR)
+        super().__init__('monitor')
         self._followed = FollowedControllers(self, wanted, BACKLASH, depth=1)
         self._selected = 0
         self._notice, self._notice_ends_s = '', 0.0
@@ -84,7 +83,7 @@ class MonitorNode(ProcessNode):
         return list(self._followed.by_name.values())
 
     def _show(self, executor: PromptExecutor, console: Console) -> None:
-        blocks = BAR if console.encoding.startswith('utf') else ASCII_BAR
+        blocks = BAR if console.encoding.startswith('utf') else '#=.'
         with pressed_keys() as keys, rich_live.Live(
             console=console, screen=True, auto_refresh=False, redirect_stdout=False,
             redirect_stderr=False,
@@ -296,11 +295,11 @@ def pressed_keys() -> Iterator[Callable[[], str]]:
 def main(args: list[str] | None = None) -> int:
     arguments = sys.argv[1:] if args is None else args
     options = viewer_options(
-        MONITOR, __doc__, 'keys: f freezes or goes on learning, c compensates or not, r (twice) '
+        'monitor', __doc__, 'keys: f freezes or goes on learning, c compensates or not, r (twice) '
         'resets the estimates,\n      s saves them, Tab takes the next controller, q ends.',
     ).parse_args(remove_ros_args(['', *arguments])[1:])
     give_way()
-    return run(MONITOR, lambda: MonitorNode(options.name), ros_arguments(arguments))
+    return run('monitor', lambda: MonitorNode(options.name), ros_arguments(arguments))
 
 
 if __name__ == '__main__':

@@ -58,7 +58,7 @@ def write_report(run: files.Run, out: Path) -> dict[str, Any]:
     for note in notes:
         print(f'report: {"" if of_log else "warning: "}{note}', file=sys.stderr)
     files.write_run(run.record, out)
-    files.write_summary(summary, out / files.SUMMARY_FILE)
+    files.write_summary(summary, out / 'summary.json')
     folded = None
     if run.parameters is not None:
         write_config(run.parameters, out / files.CONFIG_FILE)

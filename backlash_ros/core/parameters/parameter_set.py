@@ -17,13 +17,6 @@ from backlash_ros.core.parameters.parameter import (
 )
 from backlash_ros.core.parameters.table import BY_NAME, CONTROLLER, NOISE, ParameterTree
 
-# A joint of which nobody has said what it is like: v = y_m, within its limits.
-PASS_THROUGH: dict[str, object] = {
-    'plant.numerator': (1.0,), 'plant.denominator': (1.0, 0.0), 'estimator.law': 'fixed',
-    'structure': 'proportional', 'proportional.f': 0.0, 'estimator.initial.m': 1.0,
-    'estimator.initial.c_r': 0.0, 'estimator.initial.c_l': 0.0,
-}
-
 
 class Parameters(ParameterTree, Mapping[str, Value]):
     """Values by group, `p.control.max`, and by flat name, `p['control.max']`.
@@ -121,8 +114,12 @@ def _of_joint(
             )
     values = {**shared, **own, 'io.joint': joint}
     del values['joints']
-    if 'plant.denominator' not in values:
-        values.update(PASS_THROUGH)
+    if 'plant.denominator' not in values:  # nobody has said what it is like: v = y_m
+        values |= {
+            'plant.numerator': (1.0,), 'plant.denominator': (1.0, 0.0), 'estimator.law': 'fixed',
+            'structure': 'proportional', 'proportional.f': 0.0, 'estimator.initial.m': 1.0,
+            'estimator.initial.c_r': 0.0, 'estimator.initial.c_l': 0.0,
+        }
     if file := str(values.get('estimates.file', '')):
         path = PurePath(file)
         values['estimates.file'] = file.replace('{joint}', joint) if '{joint}' in file else str(

@@ -21,16 +21,16 @@ from backlash_ros.core.loop.finding import Finding, Level, LevelLog
 # std_msgs/Float64 as it goes over the wire: rclpy takes and publishes these bytes as they are, in
 # half the time of a message object. Four bytes name the encoding, the second one odd where the
 # lowest byte comes first, then comes the number (CDR: DDS Interoperability Wire Protocol, 10.2).
-FLOAT64_LITTLE, FLOAT64_BIG = Struct('<4sd'), Struct('>4sd')
+CDR_FLOAT64 = Struct('<4sd')
 
 
 def number_of(message: bytes) -> float:
-    number: float = (FLOAT64_LITTLE if message[1] & 1 else FLOAT64_BIG).unpack_from(message)[1]
+    number: float = (CDR_FLOAT64 if message[1] & 1 else Struct('>4sd')).unpack_from(message)[1]
     return number
 
 
 def message_with(number: float) -> bytes:
-    return FLOAT64_LITTLE.pack(b'\x00\x01\x00\x00', number)
+    return CDR_FLOAT64.pack(b'\x00\x01\x00\x00', number)
 
 
 # Deep enough that a recorder which is held up for a second misses nothing.

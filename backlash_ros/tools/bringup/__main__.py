@@ -1,25 +1,5 @@
-"""One command for a whole run: start the nodes, watch them, stop them, report."""
+"""One command for a whole run: start the nodes, watch them, stop them, report.
 
-from __future__ import annotations
-
-import argparse
-import os
-import signal
-import sys
-from collections.abc import Sequence
-from contextlib import ExitStack
-from typing import TYPE_CHECKING
-
-from backlash_ros import topics
-from backlash_ros.options import DONE, FAILED, OptionParser
-from backlash_ros.tools import cli
-from backlash_ros.tools.cli import BrokenOffError, InputError, StopRequests
-
-if TYPE_CHECKING:
-    from backlash_ros.tools.bringup.plan import AxisPlan, RunPlan
-    from backlash_ros.tools.bringup.watch import RunWatch
-
-EPILOG = """
 driver: with --driver COMMAND that command runs in the place of the simulated plant, until the
 controller has seen as many samples as the duration holds. {axis} in it is the name of the axis;
 axes whose commands are the same share one driver. --driver none waits for a driver that you start
@@ -51,12 +31,29 @@ environment: the processes inherit it. Unless you set them yourself,
   OMP_NUM_THREADS and its like   are 1
 """
 
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from contextlib import ExitStack
+from typing import TYPE_CHECKING
+
+from backlash_ros import topics
+from backlash_ros.options import DONE, FAILED, OptionParser
+from backlash_ros.tools import cli
+from backlash_ros.tools.cli import BrokenOffError, InputError, StopRequests
+
+if TYPE_CHECKING:
+    from backlash_ros.tools.bringup.plan import AxisPlan, RunPlan
+    from backlash_ros.tools.bringup.watch import RunWatch
+
 
 def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = OptionParser(
-        'bringup', description=__doc__, epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = OptionParser('bringup', description=__doc__,
+                          formatter_class=argparse.RawDescriptionHelpFormatter)
     cli.add_options(parser, '--config', '--set', '--axis', '--seed', '--out', '--duration')
     parser.add_argument('--driver', metavar='COMMAND', help='start this command instead of the '
                         'simulated plant; none: it is started elsewhere')
