@@ -20,12 +20,7 @@ from typing import Any
 
 from rclpy.utilities import remove_ros_args
 
-from backlash_ros.nodes.followed import (
-    ControllerState,
-    FollowedControllers,
-    give_way,
-    viewer_options,
-)
+from backlash_ros.nodes import followed
 from backlash_ros.nodes.runtime.executor import PromptExecutor
 from backlash_ros.nodes.runtime.process import ENABLED, ProcessNode, emit, ros_arguments, run
 from backlash_ros.options import LARGEST_PORT
@@ -37,6 +32,8 @@ LIVE_LABELS = (
     *BACKLASH, *(f'{name}_{end}' for name in BACKLASH for end in ('low', 'high')),
     'y_m', 'y', 'u_d', 'v', 'u_hat',
 )
+
+Point = tuple[float, float | None]
 
 
 class PageServer(ThreadingHTTPServer):
@@ -118,7 +115,7 @@ class LiveNode(ProcessNode):
     def __init__(self, wanted: Sequence[str], server: PageServer) -> None:
         super().__init__('live')
         # A machine that is held up for a second loses no point.
-        self._followed = FollowedControllers(self, wanted, LIVE_LABELS, depth=30)
+        self._followed = followed.FollowedControllers(self, wanted, LIVE_LABELS, depth=30)
         self._server = server
         self._start_ns = time.time_ns()
 
@@ -144,9 +141,9 @@ class LiveNode(ProcessNode):
             time.sleep(due_s - now_s)
         self._server.shutdown()
 
-    def _points_of(self, state: ControllerState) -> dict[str, list[tuple[float, float | None]]]:
+    def _points_of(self, state: followed.ControllerState) -> dict[str, list[Point]]:
         """What has come of each curve: time of arrival [s] and value."""
-        points: dict[str, list[tuple[float, float | None]]] = {}
+        points: dict[str, list[Point]] = {}
         for label, at_ns, value in state.watch():
             points.setdefault(label, []).append((self._seconds(at_ns), rounded(value)))
         return points
@@ -160,7 +157,7 @@ def rounded(value: float) -> float | None:
     return float(f'{value:.7g}') if isfinite(value) else None
 
 
-def content_of(state: ControllerState, now_s: float) -> dict[str, object]:
+def content_of(state: followed.ControllerState, now_s: float) -> dict[str, object]:
     """What the page says of a controller in words and numbers. now_s: on the steady clock."""
     return {
         'name': state.name, 'word': state.word(now_s), 'message': state.message,
@@ -173,7 +170,7 @@ def content_of(state: ControllerState, now_s: float) -> dict[str, object]:
 
 def main(args: list[str] | None = None) -> int:
     arguments = sys.argv[1:] if args is None else args
-    parser = viewer_options(
+    parser = followed.viewer_options(
         'live', __doc__,
         'From elsewhere: ssh -L PORT:127.0.0.1:PORT HOST, then open the same address there.',
     )
@@ -186,7 +183,7 @@ def main(args: list[str] | None = None) -> int:
         server = PageServer(options.port, kept=round(SHOWN_S / PAGE_PERIOD_S))
     except OSError as error:
         parser.error(f'--port={options.port}: {error.strerror}: choose another one, or none')
-    give_way()
+    followed.give_way()
     with server:
         return run('live', lambda: LiveNode(options.name, server), ros_arguments(arguments))
 

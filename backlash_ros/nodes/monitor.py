@@ -26,12 +26,7 @@ from rich.panel import Panel
 from rich.text import Text
 from std_srvs.srv import SetBool, Trigger
 
-from backlash_ros.nodes.followed import (
-    ControllerState,
-    FollowedControllers,
-    give_way,
-    viewer_options,
-)
+from backlash_ros.nodes import followed
 from backlash_ros.nodes.runtime.executor import PromptExecutor
 from backlash_ros.nodes.runtime.process import ProcessNode, ros_arguments, run
 from backlash_ros.topics import BACKLASH
@@ -59,7 +54,7 @@ class MonitorNode(ProcessNode):
 
     def __init__(self, wanted: Sequence[str]) -> None:
         super().__init__('monitor')
-        self._followed = FollowedControllers(self, wanted, BACKLASH, depth=1)
+        self._followed = followed.FollowedControllers(self, wanted, BACKLASH, depth=1)
         self._selected = 0
         self._notice, self._notice_ends_s = '', 0.0
         self._confirmed_until_s = 0.0  # a second r resets
@@ -79,7 +74,7 @@ class MonitorNode(ProcessNode):
         sys.stdout = open('/dev/null', 'w')  # noqa: SIM115
 
     @property
-    def _states(self) -> list[ControllerState]:
+    def _states(self) -> list[followed.ControllerState]:
         return list(self._followed.by_name.values())
 
     def _show(self, executor: PromptExecutor, console: Console) -> None:
@@ -134,7 +129,7 @@ class MonitorNode(ProcessNode):
             self._call(executor, self._states[self._selected], *ACTIONS[key])
 
     def _call(
-        self, executor: PromptExecutor, state: ControllerState, service: str, switch: str,
+        self, executor: PromptExecutor, state: followed.ControllerState, service: str, switch: str,
     ) -> None:
         """Call a service and show what it answers; the screen waits so long."""
         name, on = f'{state.node}/{service}', not state.is_on(switch)
@@ -188,7 +183,7 @@ def axis_end(largest: float) -> float:
 
 
 def screen(
-    states: Sequence[ControllerState], selected: int, notice: str, now_s: float,
+    states: Sequence[followed.ControllerState], selected: int, notice: str, now_s: float,
     width: int, height: int, blocks: str = BAR,
 ) -> Group:
     """All controllers; where there is no room, all but the selected one in a line each.
@@ -214,7 +209,7 @@ def screen(
     return Group(*parts)
 
 
-def plain_line(state: ControllerState, now_s: float) -> str:
+def plain_line(state: followed.ControllerState, now_s: float) -> str:
     parts = [f'{state.name}: {state.word(now_s)}', ', '.join(
         f'{name} {_with_band(state, name)}' for name in BACKLASH
         if isfinite(state.estimates[name][0])
@@ -228,7 +223,8 @@ def plain_line(state: ControllerState, now_s: float) -> str:
 
 
 def _panel(
-    state: ControllerState, now_s: float, width: int, events: int, chosen: bool, blocks: str,
+    state: followed.ControllerState, now_s: float, width: int, events: int, chosen: bool,
+    blocks: str,
 ) -> Panel:
     """One controller in a frame. events: how many of the newest ones."""
     inner, values, number = width - 4, state.values, state.number
@@ -261,7 +257,7 @@ def _panel(
     )
 
 
-def _with_band(state: ControllerState, name: str, width: int = 0) -> str:
+def _with_band(state: followed.ControllerState, name: str, width: int = 0) -> str:
     value, half = state.estimates[name]
     return f'{value:>{width}.5g}' + (f' ± {half:.2g}' if isfinite(half) else '')
 
@@ -294,11 +290,11 @@ def pressed_keys() -> Iterator[Callable[[], str]]:
 
 def main(args: list[str] | None = None) -> int:
     arguments = sys.argv[1:] if args is None else args
-    options = viewer_options(
+    options = followed.viewer_options(
         'monitor', __doc__, 'keys: f freezes or goes on learning, c compensates or not, r (twice) '
         'resets the estimates,\n      s saves them, Tab takes the next controller, q ends.',
     ).parse_args(remove_ros_args(['', *arguments])[1:])
-    give_way()
+    followed.give_way()
     return run('monitor', lambda: MonitorNode(options.name), ros_arguments(arguments))
 
 

@@ -17,15 +17,8 @@ from backlash_ros.core.loop.command_history import HeldControl
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import PLANT
 from backlash_ros.core.scenario import build_plant
+from backlash_ros.nodes.runtime import messages
 from backlash_ros.nodes.runtime.executor import PromptExecutor
-from backlash_ros.nodes.runtime.messages import (
-    DEPTH,
-    KEPT_QOS,
-    LabelledArrayPublisher,
-    arrival_ns,
-    clock_message,
-    message_with,
-)
 from backlash_ros.nodes.runtime.parameters import let_parameters_change
 from backlash_ros.nodes.runtime.process import ProcessNode, emit, run
 
@@ -37,12 +30,12 @@ class PlantTopics:
     """
 
     def __init__(self, node: ProcessNode) -> None:
-        self.applied = node.create_publisher(Float64, topics.APPLIED_CONTROL, DEPTH)
-        self._output = node.create_publisher(Float64, topics.PLANT_OUTPUT, DEPTH)
-        self._truth = LabelledArrayPublisher(
+        self.applied = node.create_publisher(Float64, topics.APPLIED_CONTROL, messages.DEPTH)
+        self._output = node.create_publisher(Float64, topics.PLANT_OUTPUT, messages.DEPTH)
+        self._truth = messages.LabelledArrayPublisher(
             node, topics.of_node(topics.TRUTH), topics.TRUTH_LABELS
         )
-        self._clock = node.create_publisher(Clock, topics.CLOCK, KEPT_QOS) \
+        self._clock = node.create_publisher(Clock, topics.CLOCK, messages.KEPT_QOS) \
             if node.settings.lockstep else None
         self.truth_rows: list[tuple[float, ...]] = []  # that wait until y has left
         self.outputs, self.newest = 0, -1
@@ -57,8 +50,8 @@ class PlantTopics:
     def publish_output(self, y: float, sample: int, time_s: float) -> None:
         """Publish y of a sample, in lockstep after the simulated time."""
         if self._clock is not None:
-            self._clock.publish(clock_message(round(time_s * 1e9)))
-        self._output.publish(message_with(y))
+            self._clock.publish(messages.clock_message(round(time_s * 1e9)))
+        self._output.publish(messages.message_with(y))
         self.outputs, self.newest = self.outputs + 1, sample
 
     def publish_truth(self) -> None:
@@ -131,7 +124,7 @@ class PlantNode(ProcessNode):
         if not isfinite(v):
             self._counts['non-finite controls dropped'] += 1
             return
-        self._held.take(v, arrival_ns(info['received_timestamp']))
+        self._held.take(v, messages.arrival_ns(info['received_timestamp']))
         expected, self._expecting, self._heard = self._expecting, False, True
         if expected and self.settings.lockstep:
             self._advance(v)
@@ -188,7 +181,7 @@ class PlantNode(ProcessNode):
         u = plant.step(v)
         truth = plant.backlash
         self._published.truth_rows.append((u, truth.m, truth.c_r, truth.c_l, v, float(sample)))
-        self._published.applied.publish(message_with(plant.applied))
+        self._published.applied.publish(messages.message_with(plant.applied))
 
     def _publish_output(self, latest_ns: float = inf) -> bool:
         """Measure y, and publish it unless it is lost on purpose or too late."""

@@ -28,14 +28,9 @@ from backlash_ros.bags.writer import Bag, RecordingError
 from backlash_ros.core.loop.finding import Finding, Level
 from backlash_ros.core.loop.sample_counter import UNNUMBERED
 from backlash_ros.core.parameters.table import RECORDER
+from backlash_ros.nodes.runtime import messages
 from backlash_ros.nodes.runtime.driver_io import driver_topics, output_qos
 from backlash_ros.nodes.runtime.executor import PromptExecutor
-from backlash_ros.nodes.runtime.messages import (
-    DIAGNOSTICS_PERIOD_S,
-    KEPT_QOS,
-    DiagnosticsPublisher,
-    stamp_ns_of,
-)
 from backlash_ros.nodes.runtime.process import ENABLED, ProcessNode, emit, run
 from backlash_ros.options import BAD_INPUT, FAILED
 
@@ -85,8 +80,9 @@ class RecorderNode(ProcessNode):
         # y comes last of all: it starts the loop.
         recorded = {
             # A G that was learned before this recorder came belongs into the bag as well.
-            topic: self._record(topic, kind, KEPT_QOS if topic == topics.MODEL else RECORDER_DEPTH)
-            for topic, kind in {
+            topic: self._record(
+                topic, kind, messages.KEPT_QOS if topic == topics.MODEL else RECORDER_DEPTH
+            ) for topic, kind in {
                 **dict.fromkeys(topics.LABELS_OF, Float64MultiArray),
                 topics.DIAGNOSTICS: DiagnosticArray, to.reference: to.reference_type,
                 to.applied: to.applied_type, to.control: to.control_type,
@@ -143,7 +139,7 @@ class RecorderNode(ProcessNode):
                 'the installed version of rosbags cannot be flushed: a crash of the recorder or a '
                 'power cut loses everything. Install the version that requirements/run.txt names'
             )
-        diagnostics = DiagnosticsPublisher(self, path)
+        diagnostics = messages.DiagnosticsPublisher(self, path)
 
         def diagnose() -> None:
             finding = Finding(Level.OK, 'recording', f'recording to {path}')
@@ -152,7 +148,7 @@ class RecorderNode(ProcessNode):
             # The log has it already.
             diagnostics.publish(finding, {'reason': self.failure}, logs=False)
 
-        self.create_timer(DIAGNOSTICS_PERIOD_S, diagnose, clock=self.steady_clock)
+        self.create_timer(messages.DIAGNOSTICS_PERIOD_S, diagnose, clock=self.steady_clock)
         # A crash or a power cut costs half a second, with the time that a flush takes.
         self.create_timer(0.4, lambda: self._with_bag(Bag.flush), clock=self.steady_clock)
         return bag
@@ -216,7 +212,7 @@ class RecorderNode(ProcessNode):
             self._first_signals = self._first_signals or message
 
     def _on_clock(self, message: Clock) -> None:
-        self._now_ns = stamp_ns_of(message)
+        self._now_ns = messages.stamp_ns_of(message)
 
     def _tell(self) -> None:
         """Say how the run is going, of its first joint if it has several."""

@@ -19,15 +19,9 @@ from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import REFERENCE_NODE
 from backlash_ros.core.reference.signal import PERIODIC
 from backlash_ros.core.scenario import build_reference
+from backlash_ros.nodes.runtime import messages
 from backlash_ros.nodes.runtime.driver_io import DriverIo
 from backlash_ros.nodes.runtime.executor import PromptExecutor, serve_polled
-from backlash_ros.nodes.runtime.messages import (
-    DEPTH,
-    KEPT_QOS,
-    arrival_ns,
-    message_with,
-    stamp_ns_of,
-)
 from backlash_ros.nodes.runtime.parameters import let_parameters_change
 from backlash_ros.nodes.runtime.process import ProcessNode, emit, run
 
@@ -50,7 +44,7 @@ class ReferenceNode(ProcessNode):
         self._loop_runs_at = inf  # since then, as the controller tells [s]
         self._io = DriverIo(self, p)
         self._output = self.create_publisher(
-            Float64, topics.REFERENCE, KEPT_QOS if p.lockstep else DEPTH
+            Float64, topics.REFERENCE, messages.KEPT_QOS if p.lockstep else messages.DEPTH
         )
         let_parameters_change(self, build_reference, self._take_up)
         name, listeners = self.resolve_topic_name, p.wait_for_subscribers
@@ -75,7 +69,7 @@ class ReferenceNode(ProcessNode):
     def _start(self) -> None:
         self._started = True
         if self.settings.lockstep:
-            self.create_subscription(Clock, topics.CLOCK, self._on_clock, KEPT_QOS)
+            self.create_subscription(Clock, topics.CLOCK, self._on_clock, messages.KEPT_QOS)
         emit('ready')
 
     def _follow(self, executor: PromptExecutor) -> None:
@@ -94,7 +88,7 @@ class ReferenceNode(ProcessNode):
         def hear(joints: Mapping[str, Output]) -> None:
             output = next(iter(joints.values()))
             if counter.count(output.stamp_ns, output.sequence, output.numbered).is_sample:
-                pace.hear(counter.index, arrival_ns(output.received_ns) * 1e-9)
+                pace.hear(counter.index, messages.arrival_ns(output.received_ns) * 1e-9)
 
         outputs = self._io.listen(hear, depth=1, polled=True)
         diagnostics = self.listen(
@@ -149,13 +143,13 @@ class ReferenceNode(ProcessNode):
             self._offset_s = 0.0
 
     def _on_clock(self, message: Clock) -> None:
-        self._publish(round(stamp_ns_of(message) * 1e-9 / self.settings.sample_period))
+        self._publish(round(messages.stamp_ns_of(message) * 1e-9 / self.settings.sample_period))
 
     def _publish(self, sample: int) -> None:
         # The same product as in a simulation in one process, so that runs agree to the last bit.
         self._newest = sample
         y_m = self._signal(sample * self.settings.sample_period + self._offset_s)
-        self._output.publish(message_with(y_m))
+        self._output.publish(messages.message_with(y_m))
 
 
 def main(args: list[str] | None = None) -> int:

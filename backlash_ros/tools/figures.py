@@ -108,9 +108,7 @@ def shade(axes: Axes, t: Array, where: NDArray[np.bool_], name: str) -> None:
 def limits(values: Sequence[Array], margin: float) -> tuple[float, float]:
     """Lower and upper limit of all finite values with a margin around them."""
     finite = np.concatenate([part[np.isfinite(part)] for part in values])
-    if finite.size == 0:
-        return -1.0, 1.0
-    low, high = float(finite.min()), float(finite.max())
+    low, high = (float(finite.min()), float(finite.max())) if finite.size else (-1.0, 1.0)
     room = margin * (high - low) or margin * max(abs(high), 1.0)
     return low - room, high + room
 
@@ -141,15 +139,13 @@ def draw_panels(
     for column, part in zip(grid.T, parts, strict=True):
         label(column[0], part.name)
         label(column[-1], x=TIME_LABEL)
-        for axes, lines in zip(column, rows.values(), strict=True):
+        for axes, (name, lines) in zip(column, rows.items(), strict=True):
+            label(axes, y=name if part is parts[0] else '')
             for line in lines:
                 curve(axes, line.t[part.rows], line.values[part.rows], *line[2:])
-        if frozen_in is not None:
-            frozen = frozen_in.column('status')[part.rows] >= float(Status.NOT_EXCITED)
-            for axes in column:
+            if frozen_in is not None:
+                frozen = frozen_in.column('status')[part.rows] >= float(Status.NOT_EXCITED)
                 shade(axes, frozen_in.column('t')[part.rows], frozen, 'frozen')
-    for axes, name in zip(grid[:, 0], rows, strict=True):
-        label(axes, y=name)
     return figure, grid
 
 
@@ -160,13 +156,13 @@ def draw_parameter_errors(
     t, parts = run.column('t'), (start, WHOLE_RUN)
     errors, percents = [], []
     for name in BACKLASH:
-        truth = run.column(f'true_{name}')
+        truth, hue, style = run.column(f'true_{name}'), HUES[name], LINE_STYLES[name]
         unit = BACKLASH_UNITS[name].removeprefix('unit of ')
-        look = HUES[name], f'${name} - {HATS[name]}$ [{unit}]', LINE_STYLES[name], 1.8
-        errors.append(Line(t, truth - run.column(name), *look))
+        off = truth - run.column(name)
+        errors.append(Line(t, off, hue, f'${name} - {HATS[name]}$ [{unit}]', style, 1.8))
         # Nothing is a percentage of zero, and the logarithm has no zero.
-        size = np.abs(errors[-1].values / np.where(truth == 0.0, np.nan, truth))
-        percents.append(Line(t, np.maximum(100.0 * size, 1e-300), look[0], '', look[2], 1.5))
+        size = np.maximum(100.0 * np.abs(off / np.where(truth == 0.0, np.nan, truth)), 1e-300)
+        percents.append(Line(t, size, hue, '', style, 1.5))
     figure, grid = draw_panels(7.4, {
         'true minus estimated': errors, 'size of the error [% of the true value]': percents,
     }, parts, run, sharey='row')

@@ -23,16 +23,7 @@ from backlash_ros.tools.page import Picture, facts, page, table
 from backlash_ros.tools.records.columns import parse_columns
 from backlash_ros.tools.records.reading import read_run_or_log
 from backlash_ros.tools.runs import files
-from backlash_ros.tools.runs.summary import (
-    ESTIMATE_HEADER,
-    compare_laws,
-    compared_samples,
-    control_error,
-    estimate_cells,
-    followed_reference,
-    interesting_parts,
-    summarise,
-)
+from backlash_ros.tools.runs import summary as told
 from backlash_ros.topics import BACKLASH
 
 REPORT_PAGE = 'report.html'
@@ -45,7 +36,7 @@ def write_report(run: files.Run, out: Path) -> dict[str, Any]:
     Prints on stderr what the user has to know about the source. Raises InputError for a run without
     samples.
     """
-    summary = summarise(run.record, run.parameters, run.latency_s)
+    summary = told.summarise(run.record, run.parameters, run.latency_s)
     notes, lost = list(run.notes), summary['lost_samples']
     if lost > 0.01 * (total := lost + summary['samples']) \
             and not (run.parameters and run.parameters.output_loss):
@@ -87,7 +78,7 @@ def _figures(
             figures.draw_log(run),
         )
         return
-    start, end = parts = interesting_parts(run, parameters)
+    start, end = parts = told.interesting_parts(run, parameters)
     if run.has_truth:
         yield (
             'parameter_errors.png', 'Parameter errors over time (Figure 4 of the paper)',
@@ -101,7 +92,7 @@ def _figures(
         'the law knows.', figures.draw_estimates(run),
     )
     if np.isfinite(run.column('u')).any():
-        error = control_error(run)
+        error = told.control_error(run)
         yield (
             'control_error.png', 'Control error of this run',
             'e = u − u<sub>d</sub> (3.4): what the inverse leaves of the backlash.',
@@ -114,8 +105,8 @@ def _figures(
             figures.draw_closer(run, run.column('innovation'), r'$y - \hat{y}$ [unit of y]', parts),
         )
     if run.has_truth and parameters is not None:
-        duration = compared_samples(run) * run.sample_period
-        curves, window_s, notes = compare_laws(run, parameters)
+        duration = told.compared_samples(run) * run.sample_period
+        curves, window_s, notes = told.compare_laws(run, parameters)
         yield (
             'laws.png', 'Control error of the laws (Figure 5 of the paper)',
             'This run beside the other laws, simulated with the same parameters, over the first '
@@ -129,7 +120,7 @@ def _figures(
         'The loop as the last estimates see it: u itself was not measured.',
         figures.draw_hysteresis(run, end),
     )
-    y_m, delay, followed = followed_reference(run, parameters)
+    y_m, delay, followed = told.followed_reference(run, parameters)
     yield (
         'output.png', 'Reference and output',
         'y follows y<sub>m</sub>.' if followed else
@@ -167,7 +158,7 @@ def headline(summary: Mapping[str, Any]) -> str:
 def _tables(summary: Mapping[str, Any]) -> str:
     """The backlash that was learned, and what else is known of the run."""
     rows = [
-        (symbol, *estimate_cells(summary, name), 'of u/v' if name == 'm' else 'of v')
+        (symbol, *told.estimate_cells(summary, name), 'of u/v' if name == 'm' else 'of v')
         for name, symbol in HTML_SYMBOLS.items()
     ]
     rows.append(('f', number(summary['final']['f'], 6), *[NOTHING] * 4, 'of u/v'))
@@ -176,7 +167,7 @@ def _tables(summary: Mapping[str, Any]) -> str:
     unexplained = summary['unexplained']
     first = summary['began_with']
     began = ', '.join(f'{name} {number(first[name], 6)}' for name in BACKLASH)
-    return table(('', *ESTIMATE_HEADER, 'unit'), rows) + facts([
+    return table(('', *told.ESTIMATE_HEADER, 'unit'), rows) + facts([
         ('samples', f'{summary["samples"]} in {duration:.6g} s'),
         ('lost samples', str(summary['lost_samples'])),
         ('sample period', f'{summary["sample_period"]:.6g} s'),

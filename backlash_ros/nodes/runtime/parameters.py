@@ -10,12 +10,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
-from rcl_interfaces.msg import (
-    FloatingPointRange,
-    IntegerRange,
-    ParameterDescriptor,
-    SetParametersResult,
-)
+from rcl_interfaces import msg
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
@@ -33,7 +28,7 @@ class ParameterNode(Node):
 
     def set_parameters_atomically(
         self, parameter_list: list[RosParameter],
-    ) -> SetParametersResult:
+    ) -> msg.SetParametersResult:
         """Set what differs from the present values, in the declared types.
 
         Command-line tools send 1e-6 as a text and [1, 2] as integers, and load whole files in which
@@ -50,9 +45,9 @@ class ParameterNode(Node):
                         != check_value(entry, present):
                     changes.append(_ros_parameter(name, value, entry))
         except ParameterError as error:
-            return SetParametersResult(successful=False, reason=str(error))
+            return msg.SetParametersResult(successful=False, reason=str(error))
         if not changes:
-            return SetParametersResult(successful=True)
+            return msg.SetParametersResult(successful=True)
         return super().set_parameters_atomically(changes)
 
 
@@ -86,7 +81,7 @@ def declare_parameters(
         # tell none of those that it is asked for.
         of_the_type = [''] if entry.names else [0.0]
         node.declare_parameter(
-            name, of_the_type if value == () else present.value, ParameterDescriptor(),
+            name, of_the_type if value == () else present.value, msg.ParameterDescriptor(),
             ignore_override=True,
         )
         if value == ():
@@ -110,19 +105,19 @@ def let_parameters_change(
             {change.name: change.value for change in changes if entry_of(change.name) is not None}
         )
 
-    def on_set(changes: list[RosParameter]) -> SetParametersResult:
+    def on_set(changes: list[RosParameter]) -> msg.SetParametersResult:
         for change in changes:
             entry = entry_of(change.name)
             if entry is not None and not (entry.live or is_free()):
-                return SetParametersResult(successful=False, reason=(
+                return msg.SetParametersResult(successful=False, reason=(
                     f'{change.name} is read-only while the node is configured: deactivate it and '
                     'clean it up first'
                 ))
         try:
             check(changed(changes))
         except ParameterError as error:
-            return SetParametersResult(successful=False, reason=str(error))
-        return SetParametersResult(successful=True)
+            return msg.SetParametersResult(successful=False, reason=str(error))
+        return msg.SetParametersResult(successful=True)
 
     def post_set(changes: list[RosParameter]) -> None:
         before, node.settings = node.settings, changed(changes)
@@ -132,9 +127,9 @@ def let_parameters_change(
     node.add_post_set_parameters_callback(post_set)
 
 
-def _description(entry: Parameter, name: str, reconfigurable: bool) -> ParameterDescriptor:
+def _description(entry: Parameter, name: str, reconfigurable: bool) -> msg.ParameterDescriptor:
     """What tools like rqt and `ros2 param describe` show."""
-    descriptor = ParameterDescriptor(
+    descriptor = msg.ParameterDescriptor(
         name=name, type=_ros_parameter(name, entry.default, entry).type_.value,
         description=entry.description + (f' [{entry.unit}]' if entry.unit else ''),
         additional_constraints='one of ' + ', '.join(entry.choices) if entry.choices
@@ -143,10 +138,10 @@ def _description(entry: Parameter, name: str, reconfigurable: bool) -> Parameter
     )
     bounds = {'from_value': entry.low, 'to_value': entry.high}
     if isinstance(entry.default, float) and isfinite(entry.high - entry.low):
-        descriptor.floating_point_range = [FloatingPointRange(**bounds)]
+        descriptor.floating_point_range = [msg.FloatingPointRange(**bounds)]
     elif isfinite(entry.high - entry.low) and isinstance(entry.default, int):
         whole = {end: int(value) for end, value in bounds.items()}
-        descriptor.integer_range = [IntegerRange(**whole, step=1)]
+        descriptor.integer_range = [msg.IntegerRange(**whole, step=1)]
     return descriptor
 
 

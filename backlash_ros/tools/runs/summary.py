@@ -15,13 +15,8 @@ from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.backlash import Backlash
 from backlash_ros.core.reference.signal import PERIODIC
+from backlash_ros.core.simulation import metrics
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
-from backlash_ros.core.simulation.metrics import (
-    control_error_rms,
-    delayed_reference,
-    delayed_tracking_error_rms,
-    settling_time,
-)
 from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.tools.cli import NOTHING, BrokenOffError, InputError, format_table
 from backlash_ros.tools.runs.read_run import run_loop
@@ -62,11 +57,11 @@ def summarise(
         'final_std': {name: last(f'std_{name}') for name in BACKLASH},
         'truth': {name: last(f'true_{name}') if run.has_truth else None for name in BACKLASH},
         'settling_time_s': {
-            name: settling_time(t, run.column(name), run.column(f'true_{name}'))
+            name: metrics.settling_time(t, run.column(name), run.column(f'true_{name}'))
             if run.has_truth else None for name in BACKLASH
         },
-        'control_error_rms': control_error_rms(run),
-        'tracking_error_rms': delayed_tracking_error_rms(
+        'control_error_rms': metrics.control_error_rms(run),
+        'tracking_error_rms': metrics.delayed_tracking_error_rms(
             run, reference_delay(parameters), float(t[run.samples // 2])
         ),
         'loop_latency_ms': {
@@ -209,9 +204,9 @@ def followed_reference(run: RunRecord, parameters: Parameters | None) -> tuple[A
     Then both are drawn on one scale.
     """
     delay = reference_delay(parameters)
-    error = delayed_tracking_error_rms(run, delay, float(run.column('t')[run.samples // 2]))
+    error = metrics.delayed_tracking_error_rms(run, delay, float(run.column('t')[run.samples // 2]))
     close = error is not None and error < 0.5  # of the RMS of the reference
-    return delayed_reference(run, delay), delay * run.sample_period, close
+    return metrics.delayed_reference(run, delay), delay * run.sample_period, close
 
 
 def estimated_loop(run: RunRecord) -> Array:
