@@ -179,9 +179,7 @@ def write_document(results: list[Result], first_seed: int) -> None:
     table = markdown_table(('found', 'sequences', 'seeds'), rows_of(results))
     causes = markdown_table(('begins', 'cause', 'sequences', 'seeds'), causes_of(results))
     made = f'{summary(results, first_seed)}\n\n{table}\n\n{CAUSES}\n\n{causes}\n'
-    DOCUMENT.write_text(
-        MARK.sub(lambda mark: f'{mark[1]}{made}{mark[2]}', text), encoding='utf-8'
-    )
+    DOCUMENT.write_text(MARK.sub(lambda mark: f'{mark[1]}{made}{mark[2]}', text), encoding='utf-8')
 
 
 def parse_arguments() -> argparse.Namespace:

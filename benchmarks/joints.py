@@ -26,12 +26,7 @@ import rclpy
 from builtin_interfaces.msg import Time
 from rclpy.executors import SingleThreadedExecutor
 from real_time.costs import processor_s, resident_mb
-from real_time.node_processes import (
-    node_command,
-    processes,
-    processes_in,
-    wait_for_event,
-)
+from real_time.node_processes import node_command, processes, processes_in, wait_for_event
 from reporting import ROOT, text_table
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, Header

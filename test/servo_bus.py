@@ -117,9 +117,7 @@ class EmulatedBus:
     def answer(self, data: bytes) -> bytes:
         """Take in bytes from the wire; returns those that the servos put onto it."""
         self._buffer += data
-        return b''.join(
-            status for one in self._instructions() for status in self._carry_out(*one)
-        )
+        return b''.join(status for one in self._instructions() for status in self._carry_out(*one))
 
     def _instructions(self) -> Iterator[tuple[int, int, bytes]]:
         """Whole instructions with a right CRC: ID, instruction, parameters."""

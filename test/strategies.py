@@ -77,9 +77,7 @@ def plants(draw: st.DrawFn, integrating: bool | None = None) -> TransferFunction
     return TransferFunction(numerator.tolist(), np.real(np.poly(poles)).tolist())
 
 
-def _roots(
-    draw: st.DrawFn, count: int, radii: st.SearchStrategy,
-) -> list[complex]:
+def _roots(draw: st.DrawFn, count: int, radii: st.SearchStrategy) -> list[complex]:
     roots: list[complex] = []
     while len(roots) < count:
         radius = draw(radii)

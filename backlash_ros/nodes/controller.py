@@ -80,9 +80,7 @@ class ControllerNode(ManagedNode):
                 self.log.warning(f'{joint}: {warning}' if joint else warning)
         self.loops: JointLoops | None = None  # None while unconfigured
         # A fit that shared the process of the loop would hold up its commands.
-        self._executor: Executor = (
-            Executor() if p.lockstep else WorkerExecutor(WORKER_MODULES)
-        )
+        self._executor: Executor = (Executor() if p.lockstep else WorkerExecutor(WORKER_MODULES))
         self._io = DriverIo(self, p)
         if not p.lockstep:
             # The first command begins with what the driver reports, even if it is not learned from.
@@ -112,9 +110,7 @@ class ControllerNode(ManagedNode):
             self, lambda: self.configured, self.save_estimates,
             lambda: ', '.join(joint.p.estimates.file for joint in self.joints),
         )
-        let_parameters_change(
-            self, self._check_change, self._take_up, lambda: self.loops is None
-        )
+        let_parameters_change(self, self._check_change, self._take_up, lambda: self.loops is None)
         # One joint at a time: all at once would hold up a command.
         turn = cycle(self.joints)
         self.create_timer(

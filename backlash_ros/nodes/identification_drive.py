@@ -26,9 +26,7 @@ class IdentificationDriveNode(MotionNode):
     def __init__(self, options: argparse.Namespace) -> None:
         super().__init__(IDENTIFY, options, strokes)
         self._file = options.messages.open('w', encoding='ascii')
-        self._written = {
-            topics.CONTROL: 0, topics.APPLIED_CONTROL: 0, topics.PLANT_OUTPUT: 0,
-        }
+        self._written = {topics.CONTROL: 0, topics.APPLIED_CONTROL: 0, topics.PLANT_OUTPUT: 0}
 
     def look(self) -> None:
         super().look()

@@ -173,9 +173,7 @@ class RecorderNode(ProcessNode):
             return False
         return True
 
-    def _record(
-        self, topic: str, message_type: type[Any], qos: QoSProfile | int,
-    ) -> Subscription:
+    def _record(self, topic: str, message_type: type[Any], qos: QoSProfile | int) -> Subscription:
         subscription = self.listen(
             message_type, topic, partial(self._on_message, topic), qos, raw=True
         )

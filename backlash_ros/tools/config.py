@@ -19,13 +19,7 @@ from backlash_ros.core.parameters import Parameters, check_names, check_value
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.parameter import Parameter, Value
 from backlash_ros.core.parameters.parameter_set import entry_of
-from backlash_ros.core.parameters.table import (
-    BRINGUP,
-    BY_NAME,
-    CONTROLLER,
-    NODES,
-    PARAMETERS,
-)
+from backlash_ros.core.parameters.table import BRINGUP, BY_NAME, CONTROLLER, NODES, PARAMETERS
 from backlash_ros.shipped import find_config
 from backlash_ros.tools.cli import InputError
 
@@ -186,9 +180,7 @@ def _merged(path: Path, sections: Sequence[Section]) -> dict[str, Value]:
     for rank, values in sorted(ranked, key=lambda each: each[0], reverse=True):
         for name, value in values.items():
             if ranks.setdefault(name, rank) == rank and merged.setdefault(name, value) != value:
-                raise InputError(
-                    f'{path}: {name} has two values, {merged[name]!r} and {value!r}'
-                )
+                raise InputError(f'{path}: {name} has two values, {merged[name]!r} and {value!r}')
     return merged
 
 

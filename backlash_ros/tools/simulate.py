@@ -40,9 +40,7 @@ def make_parser() -> argparse.ArgumentParser:
 
 def _simulate(args: Sequence[str] | None) -> None:
     options = make_parser().parse_args(args)
-    parameters = effective_parameters(
-        options.config, options.settings, options.seed, options.axis
-    )
+    parameters = effective_parameters(options.config, options.settings, options.seed, options.axis)
     many = options.seeds is not None or options.sweep
     if options.seeds is not None and options.seeds < 1:
         raise InputError(f'--seeds={options.seeds} must be >= 1')

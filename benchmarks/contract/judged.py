@@ -94,9 +94,7 @@ def judged(run: Record, shift: float | Array = 0.0) -> Judged:
         )
 
 
-def figures_of(
-    runs: Sequence[Judged | None], marks_s: Sequence[float],
-) -> dict[str, Figure]:
+def figures_of(runs: Sequence[Judged | None], marks_s: Sequence[float]) -> dict[str, Figure]:
     """The figures that every row of simulated runs has; None for a run that broke off."""
     whole = [run for run in runs if run is not None]
 

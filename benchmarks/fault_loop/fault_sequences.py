@@ -10,10 +10,7 @@ from math import isfinite
 import numpy as np
 from cases.random_cases import NEAR_ONE
 
-from backlash_ros.core.assembly import (
-    build_model,
-    build_true_model,
-)
+from backlash_ros.core.assembly import build_model, build_true_model
 from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.control.limits import Limits
 from backlash_ros.core.control.paper_structure import LARGEST_F_OVER_M
@@ -266,9 +263,7 @@ class Sequence:
 
     def _saved_elsewhere(self) -> Estimate:
         """What another axis with the same G has learned."""
-        m, c_r, c_l = (
-            value * float(self.rng.uniform(0.5, 2.0)) for value in self.truth
-        )
+        m, c_r, c_l = (value * float(self.rng.uniform(0.5, 2.0)) for value in self.truth)
         gap = c_r - c_l
         return Estimate(m, c_r, c_l, self.p.proportional.f,
                         1e-3 * m, 1e-3 * gap, 1e-3 * gap)
@@ -283,9 +278,7 @@ class Sequence:
             before, self._newcomer = limits.go_on_from(before, None), False
         found.commands += 1
         where = f'sample {self.driver.tick}: v {before:.6g} -> {v:.6g}, {limits}'
-        beyond, beyond_before = (
-            max(limits.low - x, x - limits.high, 0.0) for x in (v, before)
-        )
+        beyond, beyond_before = (max(limits.low - x, x - limits.high, 0.0) for x in (v, before))
         slack = ROUNDING * (1.0 + abs(v))
         # Limits that have been narrowed are met as fast as the rate allows.
         if not isfinite(v) or beyond > max(beyond_before - limits.move, 0.0) + slack:
@@ -322,9 +315,7 @@ class Sequence:
         where = f'sample {self.driver.tick}: v moved by {move:.3g}'
         if self._uninterrupted is not None:
             loop, p = self.controller.loop, self.controller.p
-            asked = self._uninterrupted.command(
-                step, loop.core, p.inverse.direction_band
-            )
+            asked = self._uninterrupted.command(step, loop.core, p.inverse.direction_band)
             if abs(v - asked) > rounding:
                 self.findings.jumps.append(f'{where} to {v:.6g}, uninterrupted to {asked:.6g}')
         elif self._moves >= LEARNED_MOVES and move > (

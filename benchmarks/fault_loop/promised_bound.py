@@ -84,9 +84,7 @@ class PromisedBound:
         """Largest u_d. known: whether something was. asked: by the references, or the gap."""
         p = self._p
         if self._structure == 'proportional':
-            f = max(
-                abs(p.proportional.f), *map(abs, p.proportional.bounds)
-            )
+            f = max(abs(p.proportional.f), *map(abs, p.proportional.bounds))
             bounds = (getattr(p.estimator.bounds, name) for name in ('c_r', 'c_l'))
             c = max(map(abs, chain(*bounds)))
             return (p.amplitude + f * c) / (1.0 - LARGEST_F_OVER_M)

@@ -26,10 +26,7 @@ from backlash_ros.core.identification.result import Identification, Options
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.parameter import Value
-from backlash_ros.tools.identify.identified_file import (
-    as_estimate,
-    identified_parameters,
-)
+from backlash_ros.tools.identify.identified_file import as_estimate, identified_parameters
 
 Array = NDArray[np.float64]
 Motion = Callable[[float], float]  # of the phase [rad], between -1 and 1
@@ -238,9 +235,7 @@ def close_loop(
     period, frequency = gear.sample_period, times * gear.frequency
     samples = round(periods / frequency / period)
     size = gear.scale * gear.swing
-    reference = size * np.array(
-        [shape(2.0 * pi * frequency * period * k) for k in range(samples)]
-    )
+    reference = size * np.array([shape(2.0 * pi * frequency * period * k) for k in range(samples)])
     physics = GearPhysics(gear)
     rows = np.zeros((samples, 6))
     applied: tuple[float, ...] = ()
@@ -256,9 +251,7 @@ def close_loop(
     y, v, motor, gap, std, status = rows.T
     delay = controller.structure.delay
     due = np.concatenate([np.full(delay, reference[0]), reference])[:samples]
-    return Run(
-        y, due, v, motor, gap, std, status.astype(int), round(first / frequency / period)
-    )
+    return Run(y, due, v, motor, gap, std, status.astype(int), round(first / frequency / period))
 
 
 def uncompensated(gear: Gear, parameters: Parameters, motion: str) -> Run:

@@ -203,9 +203,7 @@ def latency_checks(found: Latencies, law: str) -> list[Check]:
 def lockstep_speed(law: str, samples: int = LOCKSTEP_SAMPLES) -> float:
     """Samples per second of plant, controller and reference as processes in lockstep."""
     values = {'lockstep': True, 'samples': samples, 'estimator.law': law, 'seed': 1}
-    commands = {
-        name: node_command(name, values) for name in ('controller', 'reference', 'plant')
-    }
+    commands = {name: node_command(name, values) for name in ('controller', 'reference', 'plant')}
     with processes(commands) as (supervisor, _):
         started = wait_for_event(supervisor, lambda kind, who: (kind, who) == ('ready', 'plant'))
         done = wait_for_event(supervisor, lambda kind, _: kind == 'done')

@@ -18,18 +18,14 @@ NODES = 'backlash_ros.nodes'
 
 
 @contextmanager
-def processes(
-    commands: Mapping[str, Sequence[str]],
-) -> Iterator[tuple[ProcessSupervisor, int]]:
+def processes(commands: Mapping[str, Sequence[str]]) -> Iterator[tuple[ProcessSupervisor, int]]:
     """The processes of one measurement in a domain of their own; all are gone afterwards."""
     with free_domain() as domain, processes_in(domain, commands) as supervisor:
         yield supervisor, domain
 
 
 @contextmanager
-def processes_in(
-    domain: int, commands: Mapping[str, Sequence[str]],
-) -> Iterator[ProcessSupervisor]:
+def processes_in(domain: int, commands: Mapping[str, Sequence[str]]) -> Iterator[ProcessSupervisor]:
     """Processes in this domain, by name; all are gone afterwards."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -147,9 +147,7 @@ class Frames:
 
 def _draw_axes(axes: Axes, films: Films) -> list[Any]:
     """The axes of the errors; returns the curves that grow."""
-    reach = 1.15 * max(
-        float(np.abs(_error(run)).max()) for run in (films.without, films.learned)
-    )
+    reach = 1.15 * max(float(np.abs(_error(run)).max()) for run in (films.without, films.learned))
     axes.axhline(0.0, color='0.7', linewidth=0.8)
     axes.set(xlim=(0.0, _seconds(films)[-1]), ylim=(-reach, reach), xlabel='time [s]',
              yticks=(-0.4, 0.0, 0.4))

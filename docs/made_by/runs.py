@@ -16,9 +16,7 @@ from backlash_ros.tools.config import effective_parameters
 from backlash_ros.tools.runs.read_run import run_loop
 
 # No compensation: the inverse is told that there is no gap, and learns nothing.
-WITHOUT = {
-    'estimator.law': 'fixed', 'estimator.initial.c_r': '0.0', 'estimator.initial.c_l': '0.0',
-}
+WITHOUT = {'estimator.law': 'fixed', 'estimator.initial.c_r': '0.0', 'estimator.initial.c_l': '0.0'}
 
 
 @dataclass(frozen=True)

@@ -54,9 +54,7 @@ class World:
         self.probe = self.world.probe()
         self.heard = self.probe.collect('robot_joint_states', JointState)
         self.applied = self.probe.collect('applied_joint_commands', JointState)
-        self.array = self.probe.publisher(
-            'forward_command_controller/commands', Float64MultiArray
-        )
+        self.array = self.probe.publisher('forward_command_controller/commands', Float64MultiArray)
         self.by_name = self.probe.publisher('joint_commands', JointState)
         ids = [f'{name}={i + 1}' for i, name in enumerate(NAMES)]
         self.driver = subprocess.Popen(

@@ -51,9 +51,7 @@ def check(world: RosWorld, *options: str) -> tuple[int, str]:
 
 def subjects(told: str, mark: str) -> set[str]:
     """What the lines with this mark are about."""
-    return {
-        line[2:].split('  ')[0].strip() for line in told.splitlines() if line.startswith(mark)
-    }
+    return {line[2:].split('  ')[0].strip() for line in told.splitlines() if line.startswith(mark)}
 
 
 # test_driver_judgement.py has what follows from the graph; here it has to be seen through ROS.

@@ -97,9 +97,7 @@ def test_what_was_dumped_is_complete_and_loads_without_a_change(tmp_path: Path) 
                 assert before[key] == value
             client = AsyncParameterClient(probe.node, name)
             file = parameter_file(tmp_path / f'{name}.yaml', name, before)
-            loaded = probe.ask(
-                lambda c=client, f=file: c.load_parameter_file(f, True), 'an answer'
-            )
+            loaded = probe.ask(lambda c=client, f=file: c.load_parameter_file(f, True), 'an answer')
             assert [r.reason for r in loaded.results if not r.successful] == []
             assert dumped(probe, name) == before
             assert node.stop() == 0

@@ -128,9 +128,7 @@ def test_controllers_are_shown_and_the_selected_one_obeys_the_keys(tmp_path: Pat
         driver.run_until(lambda: '> /pan/controller' in screen.frame(), 'the other one')
         driver.run_until(lambda: 'no diagnostics yet' not in screen.frame(), 'its diagnostics')
         # Nothing is asked of a controller before its services are found.
-        driver.run_until(
-            lambda: screen.press('c') or 'the gap is' in pan.stderr, 'its answer'
-        )
+        driver.run_until(lambda: screen.press('c') or 'the gap is' in pan.stderr, 'its answer')
         screen.press('q')
         assert screen.wait() == 0
         assert screen.restored

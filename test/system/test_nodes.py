@@ -119,9 +119,7 @@ def test_signals_at_the_start_and_until_the_very_end_do_no_harm(tmp_path: Path) 
             node = world.start('controller')
             # Before the interpreter has come to this package, nothing can be done about it;
             # SIGINT it catches by itself.
-            wait_until(
-                lambda node=node: catches(node, signal.SIGTERM), 'a handler', lambda: None
-            )
+            wait_until(lambda node=node: catches(node, signal.SIGTERM), 'a handler', lambda: None)
             with suppress(subprocess.TimeoutExpired):
                 node.process.wait(0.25 * i)
             assert node.stop((signal.SIGINT, signal.SIGTERM)[i % 2]) == 0, node.stderr
@@ -245,9 +243,7 @@ def test_what_a_controller_publishes_is_what_layouts_show_and_latecomers_hear(tm
         controller, driver = controller_and_driver(world)
         late = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         models: list[Float64MultiArray] = []
-        driver.probe.node.create_subscription(
-            Float64MultiArray, topics.MODEL, models.append, late
-        )
+        driver.probe.node.create_subscription(Float64MultiArray, topics.MODEL, models.append, late)
         # Nothing is commanded yet: the model is the one of the parameters.
         driver.probe.wait_until(lambda: models, 'the model')
         fields, first = {}, 0

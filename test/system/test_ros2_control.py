@@ -27,9 +27,7 @@ class StandIn:
     def __init__(self, world: RosWorld, field: str, names: list[str]) -> None:
         probe = world.probe()
         self.driver = driver = PacedDriver(probe)
-        probe.node.create_subscription(
-            Float64MultiArray, topics.JOINT_COMMANDS, self._hear, 1000
-        )
+        probe.node.create_subscription(Float64MultiArray, topics.JOINT_COMMANDS, self._hear, 1000)
         self.qos = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
         self.second: Publisher | None = None
         self._states = probe.node.create_publisher(JointState, topics.JOINT_STATES, self.qos)

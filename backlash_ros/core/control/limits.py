@@ -132,9 +132,7 @@ class Limits:
         return self.acceleration * (n + (way - 0.5 * n * (n + 1)) / (n + 1))
 
 
-def last_commands(
-    action: str, motion: Motion, limits: Callable[[], Limits],
-) -> Iterator[float]:
+def last_commands(action: str, motion: Motion, limits: Callable[[], Limits]) -> Iterator[float]:
     """Commands that follow after a motion, one per sample; the last one stays in force.
 
     action: hold (v comes to rest), or zero and ramp, which go to the v nearest to 0 within the

@@ -69,9 +69,7 @@ def likelihood(r: Array, noise_std: float, step: float) -> Likelihood:
     least = mean_information(round(step / noise_std, 6)) / step**2
     # As a density, to be compared with that of readings without a step.
     log_density = log_probability - log(step)
-    return Likelihood(
-        log_density, score, np.clip(curvature / noise_std**2, least, noise_std**-2)
-    )
+    return Likelihood(log_density, score, np.clip(curvature / noise_std**2, least, noise_std**-2))
 
 
 @lru_cache(maxsize=256)

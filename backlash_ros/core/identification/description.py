@@ -18,19 +18,8 @@ from backlash_ros.core.identification.order_selection import (
 )
 from backlash_ros.core.identification.response import response_of
 from backlash_ros.core.identification.result import Details, HeldOut, Identification, Options
-from backlash_ros.core.identification.structure import (
-    TINY,
-    VAGUE,
-    Model,
-    Samples,
-    fitted,
-    moved_to,
-)
-from backlash_ros.core.identification.structure_search import (
-    StructureSearch,
-    Units,
-    observed_of,
-)
+from backlash_ros.core.identification.structure import TINY, VAGUE, Model, Samples, fitted, moved_to
+from backlash_ros.core.identification.structure_search import StructureSearch, Units, observed_of
 from backlash_ros.core.identification.verdict import CERTAIN, Findings, judge
 from backlash_ros.core.records.readings import quantum
 from backlash_ros.core.records.samples import frequencies_of

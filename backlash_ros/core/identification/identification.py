@@ -17,19 +17,10 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.fit import FIRST_STEPS
 from backlash_ros.core.identification.description import as_a_gain, described
-from backlash_ros.core.identification.order_selection import (
-    PLATEAU,
-    effective,
-    equal_delays,
-)
+from backlash_ros.core.identification.order_selection import PLATEAU, effective, equal_delays
 from backlash_ros.core.identification.response import least_response
 from backlash_ros.core.identification.result import Identification, Options
-from backlash_ros.core.identification.structure import (
-    TINY,
-    Structure,
-    fitted,
-    moved_to,
-)
+from backlash_ros.core.identification.structure import TINY, Structure, fitted, moved_to
 from backlash_ros.core.identification.structure_search import (
     EARLY,
     POLES,

@@ -10,9 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.identification.order_selection import (
-    Compared,
-)
+from backlash_ros.core.identification.order_selection import Compared
 from backlash_ros.core.identification.response import Response
 from backlash_ros.core.identification.verdict import Verdict
 from backlash_ros.core.plant.actuator import Actuator

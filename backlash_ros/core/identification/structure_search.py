@@ -230,9 +230,7 @@ def later(early: StructureSearch, options: Options) -> Generator[str, None, Stru
     return late if late.best.structure.delay < max(late.delays) and better > -ALIKE else early
 
 
-def observed_of(
-    samples: Samples, best: Model, units: Units = AS_SCALED,
-) -> Observed:
+def observed_of(samples: Samples, best: Model, units: Units = AS_SCALED) -> Observed:
     """The signals of a fit; v at the same samples as y."""
     v0, v_size, y0, y_size = units
     problem = best.problem

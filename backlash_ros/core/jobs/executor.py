@@ -160,9 +160,7 @@ class Executor:
         """End it; jobs that are under way are dropped."""
 
 
-def computed(
-    job: Job, record: SampleBuffer, since: int, end: int, args: tuple[Any, ...],
-) -> Any:
+def computed(job: Job, record: SampleBuffer, since: int, end: int, args: tuple[Any, ...]) -> Any:
     """The result of a job for the samples from `since` to before `end`; a Failure if it raises."""
     try:
         return job(record.between(since, end), *args) if record.quantities else job(*args)

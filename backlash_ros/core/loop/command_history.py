@@ -111,9 +111,7 @@ class CommandHistory:
         """Note an applied v and when the driver said so, just before the output it led to."""
         self._reported.append((stamp_ns, v))
 
-    def over(
-        self, intervals: int, end_ns: int, due_ns: float,
-    ) -> tuple[list[float], list[float]]:
+    def over(self, intervals: int, end_ns: int, due_ns: float) -> tuple[list[float], list[float]]:
         """v over each of the newest `intervals`, oldest first; the last one ended at end_ns.
 
         due_ns: when it should have ended, and so a whole number of periods after the others.

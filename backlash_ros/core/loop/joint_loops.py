@@ -85,9 +85,7 @@ class JointLoops:
 
     def end(self, action: str) -> list[ControlLoop]:
         """Have send_next lead v to its end, as ControlLoop.end; returns the loops that command."""
-        ending = [
-            loop for loop in self.loops if loop.statistics.used and not loop.standing_down
-        ]
+        ending = [loop for loop in self.loops if loop.statistics.used and not loop.standing_down]
         for loop in ending:
             loop.end(action)
         return ending

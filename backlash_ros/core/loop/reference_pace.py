@@ -20,9 +20,7 @@ class ReferencePace:
     without outputs the newest y_m is repeated. Times are on the steady clock [s].
     """
 
-    def __init__(
-        self, period_s: float, waits: bool, now_s: float, own_clock: bool = True,
-    ) -> None:
+    def __init__(self, period_s: float, waits: bool, now_s: float, own_clock: bool = True) -> None:
         self.waits = waits
         self._period_s, self._own_clock = period_s, own_clock
         self._heard = self._fresh = False  # any output; one that is not answered yet

@@ -82,9 +82,7 @@ class SampleCounter:
         self._on_time = 0  # samples that came when they were due, less the early ones
         self._strange = 0  # messages in a row that do not follow the newest sample
 
-    def count(
-        self, stamp_ns: int, sequence: int = UNNUMBERED, numbered: bool = True,
-    ) -> Arrival:
+    def count(self, stamp_ns: int, sequence: int = UNNUMBERED, numbered: bool = True) -> Arrival:
         """Take in a message and say what it is; `numbered` as in Output."""
         known = sequence != UNNUMBERED
         numbered = numbered and known

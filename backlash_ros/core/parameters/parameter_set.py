@@ -103,9 +103,7 @@ def entry_of(name: str) -> Parameter | None:
     return BY_NAME.get(name) or BY_NAME.get(name.partition('.')[2])
 
 
-def _of_joint(
-    joint: str, shared: Mapping[str, object], own: Mapping[str, object],
-) -> Parameters:
+def _of_joint(joint: str, shared: Mapping[str, object], own: Mapping[str, object]) -> Parameters:
     for name, value in own.items():
         entry = BY_NAME.get(name)
         if entry and (entry.per_node or CONTROLLER not in entry.used_by):

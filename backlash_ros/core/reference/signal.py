@@ -44,9 +44,7 @@ class ReferenceSignal:
         if self.waveform == 'multisine':
             # Schroeder's phases keep the crest low.
             harmonics = enumerate((1, 2, 3, 5))
-            return sum(
-                sin(h * self.frequency * t - pi * i * (i + 1) / 4) for i, h in harmonics
-            ) / 4
+            return sum(sin(h * self.frequency * t - pi * i * (i + 1) / 4) for i, h in harmonics) / 4
         if self.waveform == 'chirp':
             within, start = t % self._p.sweep_time, self._p.frequency_start
             slope = (self.frequency - start) / self._p.sweep_time

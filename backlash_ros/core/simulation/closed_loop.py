@@ -8,12 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from backlash_ros.core.assembly import (
-    build_controller,
-    build_model,
-    build_plant,
-    build_reference,
-)
+from backlash_ros.core.assembly import build_controller, build_model, build_plant, build_reference
 from backlash_ros.core.control.controller import AdaptiveController
 from backlash_ros.core.loop.learned_model import learned_model_of
 from backlash_ros.core.parameters import Parameters
@@ -36,9 +31,7 @@ class ClosedLoop:
     told: TransferFunction
     lose: Callable[[], bool] = field(default=lambda: False)
 
-    def run(
-        self, samples: int, on_sample: Callable[[int], None] | None = None,
-    ) -> RunRecord:
+    def run(self, samples: int, on_sample: Callable[[int], None] | None = None) -> RunRecord:
         """Simulate and return every signal; on_sample(k) is called after each sample."""
         values = array('d')  # row by row: NumPy takes longer to take in a row
         lost, v = 0, 0.0

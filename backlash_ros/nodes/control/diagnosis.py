@@ -37,9 +37,7 @@ COUNTS = {
 }
 
 
-def publishers_of(
-    node: Node, topic: str, message_type: type[Any], qos: QoSProfile,
-) -> TopicFigures:
+def publishers_of(node: Node, topic: str, message_type: type[Any], qos: QoSProfile) -> TopicFigures:
     """Those who publish what the node listens to with this quality of service."""
     return TopicFigures(topic, message_type.__name__, tuple(
         _peer(info, message_type, info.qos_profile, qos)

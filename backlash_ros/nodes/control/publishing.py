@@ -114,9 +114,7 @@ class StepPublisher:
             *(watch.look() for watch in self._watches.values()),
         ])
 
-    def publish(
-        self, loops: Mapping[str, ControlLoop], steps: Mapping[str, ControlStep],
-    ) -> None:
+    def publish(self, loops: Mapping[str, ControlLoop], steps: Mapping[str, ControlStep]) -> None:
         """Tell of the steps of a sample."""
         if self.heard:
             rows = {joint: _rows(loop, steps.get(joint)) for joint, loop in loops.items()}

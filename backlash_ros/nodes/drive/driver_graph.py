@@ -6,12 +6,7 @@ import difflib
 from collections.abc import Callable, Mapping, Sequence
 
 from rclpy.node import Node
-from rclpy.qos import (
-    QoSCompatibility,
-    QoSProfile,
-    ReliabilityPolicy,
-    qos_check_compatible,
-)
+from rclpy.qos import QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from backlash_ros import topics
@@ -80,9 +75,7 @@ class DriverGraph:
         others = ', '.join(sorted(seen.keys() - set(near))) or 'no other topic'
         print(f'  sees {"besides " if near else ""}{others}', flush=True)
 
-    def _topics(
-        self, endpoints: Callable[[str], list[TopicEndpointInfo]],
-    ) -> dict[str, list[str]]:
+    def _topics(self, endpoints: Callable[[str], list[TopicEndpointInfo]]) -> dict[str, list[str]]:
         """Topics that others have such endpoints of, with their types, but for those of ROS."""
         return {
             topic: types for topic, types in self._node.get_topic_names_and_types()
@@ -99,9 +92,7 @@ class DriverGraph:
 
 
 def _has_best_effort(endpoints: Sequence[TopicEndpointInfo]) -> bool:
-    return any(
-        info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT for info in endpoints
-    )
+    return any(info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT for info in endpoints)
 
 
 def _misfit(asked: QoSProfile) -> str:
@@ -112,9 +103,7 @@ def _misfit(asked: QoSProfile) -> str:
     return f'control: {reason}' if compatibility == QoSCompatibility.ERROR else ''
 
 
-def similar_topics(
-    wanted: str, wanted_type: str, seen: Mapping[str, Sequence[str]],
-) -> list[str]:
+def similar_topics(wanted: str, wanted_type: str, seen: Mapping[str, Sequence[str]]) -> list[str]:
     """Topics (with their types) that may be the wanted one under another name, likeliest first."""
     def likeness(topic: str) -> float:
         last, other = (name.rsplit('/', 1)[-1] for name in (wanted, topic))

@@ -85,9 +85,7 @@ class DiagnosticsPublisher:
         self._message = DiagnosticArray(status=[self._status])
         self._log = LevelLog(self._write)
 
-    def publish(
-        self, finding: Finding, values: Mapping[str, object], logs: bool = True,
-    ) -> None:
+    def publish(self, finding: Finding, values: Mapping[str, object], logs: bool = True) -> None:
         """finding: what is going on, and what to do if it is wrong. values: details to it.
 
         logs: False for what another part of the node has to say in the log.

@@ -51,9 +51,7 @@ class ParameterNode(Node):
         return super().set_parameters_atomically(changes)
 
 
-def declare_parameters(
-    node: Node, executable: str, reconfigurable: bool = False,
-) -> Parameters:
+def declare_parameters(node: Node, executable: str, reconfigurable: bool = False) -> Parameters:
     """Declare what the table says this executable uses; return the complete, checked set.
 
     reconfigurable: whether all but the fixed ones may change while the node is unconfigured.
@@ -152,9 +150,7 @@ def _given_value(parameter: RosParameter) -> object:
     entry = entry_of(parameter.name)
     if entry is not None and (entry.names or entry.default == ()):
         return ()
-    raise ParameterError(
-        parameter.name, UNTOLD, 'has no value', 'give it one or leave it out'
-    )
+    raise ParameterError(parameter.name, UNTOLD, 'has no value', 'give it one or leave it out')
 
 
 def _ros_parameter(name: str, value: Value, entry: Parameter) -> RosParameter:

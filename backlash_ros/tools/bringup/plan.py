@@ -220,9 +220,7 @@ def _node(axis: AxisPlan, node: str, domain: int | None) -> Child:
     )
 
 
-def _driver(
-    plan: RunPlan, command: str, axes: Sequence[AxisPlan], domain: int | None,
-) -> Child:
+def _driver(plan: RunPlan, command: str, axes: Sequence[AxisPlan], domain: int | None) -> Child:
     name, log = axes[0].process_name('driver'), axes[0].logs / 'driver.log'
     if len(axes) > 1:
         names = [axis.name for axis in axes]

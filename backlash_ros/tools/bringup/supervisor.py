@@ -110,9 +110,7 @@ class ProcessSupervisor:
     started together. hurry: asked while stopping; once it says yes, nobody is given any more time.
     """
 
-    def __init__(
-        self, stages: Sequence[Sequence[Child]], hurry: Callable[[], bool],
-    ) -> None:
+    def __init__(self, stages: Sequence[Sequence[Child]], hurry: Callable[[], bool]) -> None:
         self._planned, self._hurry = stages, hurry
         self._stages: list[list[Child]] = [[] for _ in stages]
         self._selector = selectors.DefaultSelector()

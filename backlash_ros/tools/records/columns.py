@@ -52,9 +52,7 @@ def parse_columns(text: str) -> dict[str, str]:
     return given
 
 
-def choose_columns(
-    names: Sequence[str], given: Mapping[str, str],
-) -> tuple[dict[str, str], str]:
+def choose_columns(names: Sequence[str], given: Mapping[str, str]) -> tuple[dict[str, str], str]:
     """The columns of a table with these names by role, and what was guessed, '' for nothing.
 
     given: by role, as the user says. Raises RecordError that names the columns where one is missing

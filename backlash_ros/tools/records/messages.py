@@ -60,9 +60,7 @@ def read_bag_record(
     return replace(record, notes=tuple(filter(None, (note, *record.notes, damage))))
 
 
-def from_messages(
-    heard: Mapping[str, Messages], period: float | None, of_axis: str = '',
-) -> Record:
+def from_messages(heard: Mapping[str, Messages], period: float | None, of_axis: str = '') -> Record:
     """From stamps [ns] and values by topic, plant_output among them.
 
     v is that of applied_control where it is reported, else that of control. period [s]: from sample

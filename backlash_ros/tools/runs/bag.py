@@ -218,9 +218,7 @@ def _names_of(content: Content, topic: str) -> list[str]:
     ), key=lambda name: (not f'/{name}'.endswith(f'/{topic}'), name))
 
 
-def _tabulate(
-    topic: str, messages: Sequence[tuple[int, Any]], prefix: str, begin_ns: int,
-) -> Table:
+def _tabulate(topic: str, messages: Sequence[tuple[int, Any]], prefix: str, begin_ns: int) -> Table:
     """The messages of a topic, of several joints what is about the one with this prefix."""
     if not messages:  # a real plant does not know its truth
         return {label: np.empty(0) for label in (*topics.LABELS_OF[topic], 'stamp')}

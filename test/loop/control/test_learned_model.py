@@ -14,12 +14,7 @@ from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.limits import Limits
 from backlash_ros.core.control.protocol import ControlStructure
 from backlash_ros.core.control.redesign import LONGEST_WAIT
-from backlash_ros.core.control.tracking.design import (
-    TrackingDesign,
-    Weights,
-    better_design,
-    design,
-)
+from backlash_ros.core.control.tracking.design import TrackingDesign, Weights, better_design, design
 from backlash_ros.core.control.tracking.margin import modulus_margin
 from backlash_ros.core.control.tracking.tracking import Tracking
 from backlash_ros.core.estimate import Estimate
@@ -114,9 +109,7 @@ def run(
     model, better = StateModel(told), StateModel(true)
     learner = Learner(model, better, after, 0.1)
     structure = Tracking(design(model, WEIGHTS), WEIGHTS, 1.0, NOISE)
-    controller = AdaptiveController(
-        learner, structure, BacklashInverse(), Limits(), redesign=True
-    )
+    controller = AdaptiveController(learner, structure, BacklashInverse(), Limits(), redesign=True)
     rng = np.random.default_rng(1)
     plant = SimulatedPlant(Parameters({
         'backlash.m': TRUTH.m, 'backlash.c_r': TRUTH.c_r, 'backlash.c_l': TRUTH.c_l,

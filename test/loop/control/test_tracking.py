@@ -6,12 +6,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy import signal
 
-from backlash_ros.core.assembly import (
-    build_controller,
-    build_model,
-    build_plant,
-    build_reference,
-)
+from backlash_ros.core.assembly import build_controller, build_model, build_plant, build_reference
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.tracking.design import Weights, design
 from backlash_ros.core.control.tracking.feedback import shrunk_crossings
@@ -56,9 +51,7 @@ def simulate(p: Parameters, samples: int, y_m: np.ndarray | None = None) -> RunR
 
 
 def error(p: Parameters, samples: int = 500) -> float:
-    value = delayed_tracking_error_rms(
-        simulate(p, samples), p.tracking.preview, since=2.0
-    )
+    value = delayed_tracking_error_rms(simulate(p, samples), p.tracking.preview, since=2.0)
     assert value is not None
     return value
 

@@ -42,17 +42,13 @@ def run(spoil: Spoil, samples: int = SAMPLES) -> dict[str, list[float]]:
 
     p = parameters()
     before = {joint: first_guess(p.of_joint(joint)) for joint in JOINTS}
-    loops = JointLoops(
-        p, send, lambda joint: Driver(lambda: now_ns), before, SampleCounter(PERIOD)
-    )
+    loops = JointLoops(p, send, lambda joint: Driver(lambda: now_ns), before, SampleCounter(PERIOD))
     plays = {joint: Backlash(1.0, 0.03 + 0.01 * k, -0.04) for k, joint in enumerate(JOINTS)}
     y = dict.fromkeys(JOINTS, 0.0)
     v = dict.fromkeys(JOINTS, 0.0)
     for k in range(samples):
         now_ns = round((1.0 + k * PERIOD) * 1e9)
-        loops.take_references({
-            joint: 0.5 * np.sin(0.02 * k + i) for i, joint in enumerate(JOINTS)
-        })
+        loops.take_references({joint: 0.5 * np.sin(0.02 * k + i) for i, joint in enumerate(JOINTS)})
         newest.clear()
         loops.answer({
             joint: Output(value, now_ns, now_ns, now_ns, k, False)

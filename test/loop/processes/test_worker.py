@@ -16,12 +16,7 @@ from places import ROOT
 from waiting import wait_until
 from worker_jobs import checksum, foreign_modules, last_for_ever
 
-from backlash_ros.core.jobs.executor import (
-    LOST,
-    Channel,
-    ChannelSamples,
-    Failure,
-)
+from backlash_ros.core.jobs.executor import LOST, Channel, ChannelSamples, Failure
 from backlash_ros.core.jobs.worker import WorkerExecutor
 
 KILLED = 6  # times

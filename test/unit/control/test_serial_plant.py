@@ -59,9 +59,7 @@ def test_lag_and_wind_up_of_the_motor_are_made_up_for() -> None:
 
 
 def test_lost_outputs_are_stepped_over() -> None:
-    loop = build_closed_loop(TRUE.replaced({
-        'output_loss': 0.2, 'tracking.input_weight': 0.1,
-    }))
+    loop = build_closed_loop(TRUE.replaced({'output_loss': 0.2, 'tracking.input_weight': 0.1}))
     record = loop.run(SAMPLES)
     assert record.lost_samples > 100
     y, t = record.column('y'), record.column('t')

@@ -11,12 +11,7 @@ from backlash_ros.core.control.paper_structure import Proportional
 from backlash_ros.core.control.protocol import Command, ControlInput
 from backlash_ros.core.estimate import Bounds, Estimate
 from backlash_ros.core.law import Interval
-from backlash_ros.core.laws.printed_law import (
-    PrintedLaw,
-    printed_c,
-    printed_f,
-    printed_m,
-)
+from backlash_ros.core.laws.printed_law import PrintedLaw, printed_c, printed_f, printed_m
 
 
 def feed(estimator: PrintedLaw, u: float, y_m: float) -> Estimate:

@@ -22,9 +22,7 @@ def signal(waveform: str, samples: tuple[float, ...] = (), **values: object) -> 
 
 
 @given(t=st.floats(0.0, 100.0), amplitude=st.floats(0.0, 10.0), bias=st.floats(-10.0, 10.0),
-       waveform=st.sampled_from([
-           w for w in BY_NAME['waveform'].choices if w != 'file'
-       ]))
+       waveform=st.sampled_from([w for w in BY_NAME['waveform'].choices if w != 'file']))
 def test_every_waveform_stays_within_amplitude_around_bias(t, amplitude, bias, waveform):
     y_m = signal(waveform, amplitude=amplitude, bias=bias)(t)
     assert abs(y_m - bias) <= amplitude + 1e-9

@@ -27,7 +27,5 @@ def test_constant_has_one_home_in_the_package() -> None:
         for name in constants(path):
             homes[name].add(path.relative_to(package).as_posix())
     assert len(homes) > 100
-    twice = {
-        name: sorted(files) for name, files in homes.items() if len(files) > 1
-    }
+    twice = {name: sorted(files) for name, files in homes.items() if len(files) > 1}
     assert twice == {}

@@ -75,9 +75,7 @@ def console_scripts() -> set[str]:
 def anchors(page: Path) -> set[str]:
     """Return the anchors of the headings, as they are formed on the web."""
     headings = re.findall(r'^#+ (.*)$', page.read_text(), re.MULTILINE)
-    return {
-        re.sub(r'[^\w\- ]', '', heading.lower()).replace(' ', '-') for heading in headings
-    }
+    return {re.sub(r'[^\w\- ]', '', heading.lower()).replace(' ', '-') for heading in headings}
 
 
 def test_links_lead_to_files_and_headings() -> None:

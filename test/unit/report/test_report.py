@@ -22,12 +22,7 @@ from backlash_ros.tools.config import write_config
 from backlash_ros.tools.runs.bag import read_bag
 from backlash_ros.tools.runs.files import Run, write_run
 from backlash_ros.tools.runs.read_run import read_run
-from backlash_ros.tools.runs.summary import (
-    compare_laws,
-    followed_reference,
-    moving_rms,
-    summarise,
-)
+from backlash_ros.tools.runs.summary import compare_laws, followed_reference, moving_rms, summarise
 
 
 @pytest.fixture(scope='module')

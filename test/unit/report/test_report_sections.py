@@ -114,9 +114,7 @@ def test_saved_results_are_cut_likewise(tmp_path: Path, first: RunRecord) -> Non
 
 
 def test_truth_belongs_to_the_sample_with_its_v_where_the_counts_differ(tmp_path, first):
-    bag = write_pieces(
-        tmp_path / 'bag', Piece(first, first=179_536_708_930, truth_first=17)
-    )
+    bag = write_pieces(tmp_path / 'bag', Piece(first, first=179_536_708_930, truth_first=17))
     u = read_bag(bag).record.column('u')
     assert np.array_equal(u, first.column('u'))
 

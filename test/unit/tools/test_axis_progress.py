@@ -5,11 +5,7 @@ from pathlib import Path
 import pytest
 
 from backlash_ros.tools.bringup.plan import AxisPlan
-from backlash_ros.tools.bringup.watch import (
-    FIRST_SAMPLE_DEADLINE_S,
-    LATE_DEADLINE_S,
-    AxisProgress,
-)
+from backlash_ros.tools.bringup.watch import FIRST_SAMPLE_DEADLINE_S, LATE_DEADLINE_S, AxisProgress
 from backlash_ros.tools.cli import BrokenOffError
 from backlash_ros.tools.config import effective_parameters
 

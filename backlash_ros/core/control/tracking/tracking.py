@@ -10,12 +10,7 @@ from itertools import pairwise
 
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.protocol import Command, ControlInput, ControlStructure
-from backlash_ros.core.control.tracking.design import (
-    TrackingDesign,
-    Weights,
-    better_design,
-    design,
-)
+from backlash_ros.core.control.tracking.design import TrackingDesign, Weights, better_design, design
 from backlash_ros.core.control.tracking.feedback import StateFeedback, shrunk_crossings
 from backlash_ros.core.control.tracking.rest import OFF, Rest
 from backlash_ros.core.control.tracking.trajectory import IdealTrajectory, TrajectoryState
@@ -202,9 +197,7 @@ class Tracking(ControlStructure):
         hand_over.leading = False
         return trajectory.take(y_m)
 
-    def _side(
-        self, turned: bool, u_d: float, noise: float, inverse: BacklashInverse,
-    ) -> Region:
+    def _side(self, turned: bool, u_d: float, noise: float, inverse: BacklashInverse) -> Region:
         """Return the side of the gap for u_d.
 
         A crossing costs wear and noise. The trajectory has no noise and is known ahead, so it
