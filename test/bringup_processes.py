@@ -78,12 +78,12 @@ class Session:
 def bringup_sessions(folder: Path) -> Iterator[Callable[..., Session]]:
     """Start bringup with arguments; whatever is left of it at the end is killed.
 
-    drawn: with the pictures of the report, which take longer than most runs.
+    Reports have no pictures, which take longer than most runs.
     """
     sessions: list[Session] = []
 
     def start_session(
-        *arguments: str, variables: Mapping[str, str] | None = None, drawn: bool = False,
+        *arguments: str, variables: Mapping[str, str] | None = None,
     ) -> Session:
         own = folder / str(len(sessions))
         own.mkdir()
@@ -94,7 +94,7 @@ def bringup_sessions(folder: Path) -> Iterator[Callable[..., Session]]:
             environment.pop(variable, None)
         environment.update(variables or {})
         stdout, stderr = own / 'stdout.txt', own / 'stderr.txt'
-        whole = drawn or '--no-record' in arguments
+        whole = '--no-record' in arguments
         program = ['-m', 'backlash_ros.tools.bringup'] if whole else [
             str(UNDRAWN), bringup.__name__]
         with stdout.open('wb') as out, stderr.open('wb') as err:

@@ -20,7 +20,7 @@ from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.estimates_file import was_given
 from backlash_ros.core.parameters import Parameters
 
-SAMPLES, RESTS_FROM = 1500, 900
+SAMPLES, RESTS_FROM = 1000, 500
 SEED = 5
 NOISE = 1e-7  # deviation of the noise on y [unit of y]
 LOST = 0.1  # share of the samples

@@ -18,7 +18,7 @@ BLOCKS = re.findall(
 )
 # Beside these the commands that follow them are run.
 FOREVER = ('motor_driver.py', 'bare_dds_driver.py', '/controller', '/reference')
-SHORT = {'--duration': '2'}  # s; the pages give a user more time
+SHORT_S = {'check_driver': '2', 'bringup': '1'}  # the pages give a user more time
 DEADLINE_S = 240.0
 
 
@@ -34,9 +34,8 @@ def runnable(words: list[str]) -> list[str]:
     modules = dict(
         re.findall(r"f'(\w+) = \{PACKAGE\}\.([\w.]+):main'", (ROOT / 'setup.py').read_text())
     )
-    if name != 'identify':  # which needs its time
-        for i, argument in enumerate(arguments[:-1]):
-            arguments[i + 1] = SHORT.get(argument, arguments[i + 1])
+    if name in SHORT_S and '--duration' in arguments:
+        arguments[arguments.index('--duration') + 1] = SHORT_S[name]
     arguments = [a.replace('.venv/bin/python', sys.executable) for a in arguments]
     if name == 'python':
         return [sys.executable, *arguments]

@@ -22,7 +22,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
     """A run of two axes without end, with its page."""
     with bringup_sessions(tmp_path_factory.mktemp('live')) as start_session:
         session = start_session(
-            '--config', 'two_axes.yaml', '--duration', 'inf', '--no-record', '--live'
+            '--config', 'two_axes.yaml', '--duration', 'inf', '--no-record', '--live',
+            '--set', 'estimator.law=lms',
         )
         address_of(session)
         session.wait_for_samples('pan')

