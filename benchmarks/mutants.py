@@ -73,7 +73,7 @@ with TemporaryDirectory() as folder:
     out = pytest('-vvrA', '-nauto', '--durations=0', *options.tests, NOTES=f'{folder}/notes')
     took = dict.fromkeys(re.findall('^PASSED (.+)', out, re.MULTILINE), 0.0)
     for seconds, test in re.findall(r'^([\d.]+)s (?:setup|call) +(.+)', out, re.MULTILINE):
-        took[test] = took.get(test, 1e9) + float(seconds)
+        took |= {test: took[test] + float(seconds)} if test in took else {}
     notes = [note.partition(' ')[::2] for note in Path(folder, 'notes').read_text().splitlines()]
     for k, change in enumerate(says):
         past = {test for number, test in notes if number == str(k)}
