@@ -50,12 +50,8 @@ class Backlash:
         """Move the input to v and return u(t)."""
         # c_l < c_r puts the upward line m (v - c_r) below the downward one, so that the three
         # cases of (2.1) are one clamp of u(t-1) between the two lines.
-        upward = self.m * (v - self.c_r)
-        downward = self.m * (v - self.c_l)
-        if self.u <= upward:
-            self.u, self.region = upward, Region.RIGHT
-        elif self.u >= downward:
-            self.u, self.region = downward, Region.LEFT
-        else:
-            self.region = Region.GAP
+        upward, downward = self.m * (v - self.c_r), self.m * (v - self.c_l)
+        self.u = clamp(self.u, upward, downward)
+        self.region = Region.RIGHT if self.u == upward else \
+            Region.LEFT if self.u == downward else Region.GAP
         return self.u

@@ -44,33 +44,24 @@ def model_warnings(
 
     frequency: of the reference [rad/s], if it is known.
     """
-    poles, found = model.poles, []
-    slow = [pole for pole in poles if ON_CIRCLE < 1.0 - abs(pole) < 1e-4]
-    if slow:
-        found.append(
-            f'the pole {_text(slow[0])} is slower than 10000 samples: sample_period='
-            f'{sample_period:g} s is short for this plant'
-        )
-    if np.count_nonzero(np.abs(poles - 1.0) < 1e-3) > 1:
-        found.append('G(z) integrates more than once: y drifts fast while u is not yet right')
-    circle = [zero for zero in model.zeros if abs(abs(zero) - 1.0) < 1e-3]
-    if circle:
-        found.append(
-            f'the zero {_text(circle[0])} lies on the unit circle: motion of u at that '
-            'frequency does not show in y'
-        )
-    if np.linalg.cond(StateModel(model).to_observer) > 1e9:
-        found.append(
-            'the coefficients of G(z) determine its states badly: give more digits, or a longer '
-            'sample_period'
-        )
+    poles = model.poles
+    slow = [_text(pole) for pole in poles if ON_CIRCLE < 1.0 - abs(pole) < 1e-4]
+    circle = [_text(zero) for zero in model.zeros if abs(abs(zero) - 1.0) < 1e-3]
     samples = 2.0 * np.pi / (frequency * sample_period) if frequency is not None else 100.0
-    if not 10.0 <= samples <= 1e5:
-        found.append(
-            f'frequency={frequency:g} rad/s has {samples:.3g} samples per period, between 10 and '
-            '100000 are sensible: change sample_period'
-        )
-    return found
+    return [text for true, text in (
+        (slow, f'the pole {"".join(slow[:1])} is slower than 10000 samples: sample_period='
+               f'{sample_period:g} s is short for this plant'),
+        (np.count_nonzero(np.abs(poles - 1.0) < 1e-3) > 1,
+         'G(z) integrates more than once: y drifts fast while u is not yet right'),
+        (circle, f'the zero {"".join(circle[:1])} lies on the unit circle: motion of u at that '
+                 'frequency does not show in y'),
+        (np.linalg.cond(StateModel(model).to_observer) > 1e9,
+         'the coefficients of G(z) determine its states badly: give more digits, or a longer '
+         'sample_period'),
+        (not 10.0 <= samples <= 1e5,
+         f'frequency={frequency or 0.0:g} rad/s has {samples:.3g} samples per period, between 10 '
+         'and 100000 are sensible: change sample_period'),
+    ) if true]
 
 
 def _text(root: complex) -> str:

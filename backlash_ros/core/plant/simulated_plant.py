@@ -90,11 +90,8 @@ class SimulatedPlant:
     def _wear(self) -> None:
         hidden, t = self._p.backlash, self.sample * self._p.sample_period
         jump = hidden.jump if t >= hidden.jump_time else (0.0, 0.0, 0.0)
-        begun_with = hidden.m, hidden.c_r, hidden.c_l
-        m, c_r, c_l = (
-            value + rate * t + step
-            for value, rate, step in zip(begun_with, hidden.rate, jump, strict=True)
-        )
+        m, c_r, c_l = (value + rate * t + step for value, rate, step in zip(
+            (hidden.m, hidden.c_r, hidden.c_l), hidden.rate, jump, strict=True))
         check_backlash(m, c_r, c_l)
         self.backlash.m, self.backlash.c_r, self.backlash.c_l = m, c_r, c_l
 
@@ -121,7 +118,10 @@ def altered_plant(
         return delayed(model, whole)
     from scipy.linalg import expm, logm  # takes long to load, and few plants need it
 
-    inner, delay = _without_delay(model)
+    numerator_z, denominator_z, delay = model.without_delay()
+    inner = TransferFunction(numerator_z, denominator_z)
+    if inner.denominator[-1] == 0.0:
+        raise _refused(model, 'has poles at 0 that are no delay by whole samples:')
     poles = _continuous_poles(inner)
     n = len(poles)
     sampled = _block(*inner.state_space()[:2])
@@ -138,10 +138,9 @@ def altered_plant(
     b_z = np.append(_numerator(transition, over[:n, n], denominator), 0.0)
     # What was commanded a sample before acts for the first part of this one.
     b_z[1:] += _numerator(transition, over[:n, :n] @ over_part[:n, n], denominator)
-    return delayed(
-        TransferFunction(b_z.tolist(), [*denominator, 0.0]) if part > 1e-9
-        else TransferFunction(b_z[:n].tolist(), denominator.tolist()), delay + whole,
-    )
+    late = int(part > 1e-9)
+    altered = TransferFunction(b_z[:n + late].tolist(), [*denominator, *[0.0] * late])
+    return delayed(altered, delay + whole)
 
 
 def _block(a: Array, b: Array) -> Array:
@@ -161,32 +160,21 @@ def _numerator(a: Array, b: Array, denominator: Array) -> Array:
     return np.asarray(product[:len(a)], np.float64)
 
 
-def _without_delay(model: TransferFunction) -> tuple[TransferFunction, int]:
-    """G(z) without its poles at 0, and their number."""
-    denominator = np.trim_zeros(model.denominator, 'b')
-    delay = len(model.denominator) - len(denominator)
-    numerator = model.numerator[model.delay:]
-    if len(numerator) >= len(denominator):
-        raise ParameterError(
-            'plant.denominator', model.denominator.tolist(),
-            f'has {delay} poles at 0 that are no delay by whole samples, which truth.scale_* and '
-            'truth.extra_lag cannot alter', 'give truth.numerator and truth.denominator instead',
-        )
-    return TransferFunction(numerator.tolist(), denominator.tolist()), delay
-
-
 def _continuous_poles(model: TransferFunction) -> Roots:
     poles = model.poles
     negative = (poles.real < 0.0) & (np.abs(poles.imag) <= 1e-6 * np.abs(poles))
     if negative.any():
-        raise ParameterError(
-            'plant.denominator', model.denominator.tolist(),
-            f'has the pole {float(poles[negative][0].real):.6g}: no continuous plant has poles on '
-            'the negative real axis, so that truth.scale_* and truth.extra_lag cannot alter it',
-            'give truth.numerator and truth.denominator instead',
-        )
+        raise _refused(model, f'has the pole {float(poles[negative][0].real):.6g}: no continuous '
+                       'plant has poles on the negative real axis, so that')
     # Rounding moves a double pole by 1e-8.
     return np.where(np.abs(poles - 1.0) < 1e-6, 0.0, np.log(poles))
+
+
+def _refused(model: TransferFunction, why: str) -> ParameterError:
+    return ParameterError(
+        'plant.denominator', model.denominator.tolist(),
+        f'{why} truth.scale_* and truth.extra_lag cannot alter it',
+        'give truth.numerator and truth.denominator instead')
 
 
 def _damped(poles: Roots, factor: float) -> Roots:
