@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.plant.state_model import StateModel
+from backlash_ros.core.plant.transfer_function import StateModel
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.law import StateSource
-from backlash_ros.core.plant.state_model import StateModel
+from backlash_ros.core.plant.transfer_function import StateModel
 
 # Largest feedback, whatever y does, in units of the u that the reference has asked for so far or
 # that the gap takes: while the backlash is unknown, as wrong as a first guess may be; later what

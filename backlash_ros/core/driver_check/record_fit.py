@@ -24,8 +24,7 @@ from backlash_ros.core.estimation.explanations import (
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.posterior import WindowFit
 from backlash_ros.core.estimation.settings import REVERSALS, STD_GAP, STD_SLOPE
-from backlash_ros.core.plant.state_model import StateModel
-from backlash_ros.core.plant.transfer_function import TransferFunction
+from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
 from backlash_ros.core.records.samples import check_record, outliers
 from backlash_ros.core.simulation.metrics import turns
 

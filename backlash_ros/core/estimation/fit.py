@@ -24,7 +24,7 @@ from backlash_ros.core.estimation.plant_family import Family, filtered, padded, 
 from backlash_ros.core.estimation.play import LEFT, NEITHER, engaged, hats, play, reversals, walk
 from backlash_ros.core.estimation.posterior import Prior, Start, WindowFit, error_of_plant
 from backlash_ros.core.estimation.reading import Likelihood, independence, likelihood, step_of
-from backlash_ros.core.plant.filtering import lfilter
+from backlash_ros.core.plant.numerics import lfilter
 
 Array = NDArray[np.float64]
 

@@ -25,9 +25,9 @@ from backlash_ros.core.estimation.explanations import Window
 from backlash_ros.core.estimation.fit import Problem
 from backlash_ros.core.estimation.play import play
 from backlash_ros.core.estimation.posterior import WindowFit
-from backlash_ros.core.plant.filtering import lfilter
 from backlash_ros.core.plant.model_check import ON_CIRCLE
-from backlash_ros.core.plant.state_model import memory_of
+from backlash_ros.core.plant.numerics import lfilter
+from backlash_ros.core.plant.transfer_function import memory_of
 
 Array = NDArray[np.float64]
 

@@ -27,9 +27,8 @@ from backlash_ros.core.estimation.settings import GATE, OUTLIERS
 from backlash_ros.core.law import Interval
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.plant.backlash import clamp
-from backlash_ros.core.plant.riccati import lyapunov, riccati
-from backlash_ros.core.plant.state_model import StateModel, powers
-from backlash_ros.core.plant.transfer_function import TransferFunction
+from backlash_ros.core.plant.numerics import lyapunov, riccati
+from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction, powers
 
 Array = NDArray[np.float64]
 

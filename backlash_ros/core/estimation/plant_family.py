@@ -21,10 +21,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.plant.filtering import lfilter
 from backlash_ros.core.plant.model_check import ON_CIRCLE
-from backlash_ros.core.plant.state_model import memory_of
-from backlash_ros.core.plant.transfer_function import TransferFunction
+from backlash_ros.core.plant.numerics import lfilter
+from backlash_ros.core.plant.transfer_function import TransferFunction, memory_of
 
 Array = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from backlash_ros.core.estimation.plant_family import Family, state_columns
 from backlash_ros.core.estimation.play import plays
 from backlash_ros.core.estimation.settings import ROWS
-from backlash_ros.core.plant.filtering import lfilter
+from backlash_ros.core.plant.numerics import lfilter
 
 Array = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from backlash_ros.core.identification.result import Identification
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.actuator import Actuator
-from backlash_ros.core.plant.filtering import lfilter
+from backlash_ros.core.plant.numerics import lfilter
 from backlash_ros.core.plant.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.play import LEFT, engaged, play
-from backlash_ros.core.plant.filtering import lfilter
+from backlash_ros.core.plant.numerics import lfilter
 
 Array = NDArray[np.float64]
 

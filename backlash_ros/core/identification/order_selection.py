@@ -34,7 +34,7 @@ from backlash_ros.core.identification.structure import (
     fitted,
     with_pole,
 )
-from backlash_ros.core.plant.filtering import lfilter
+from backlash_ros.core.plant.numerics import lfilter
 
 Array = NDArray[np.float64]
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from backlash_ros.core.estimation.fit import STEPS, Problem
 from backlash_ros.core.estimation.play import LEFT, RIGHT, play, reversals
 from backlash_ros.core.estimation.posterior import Prior, WindowFit
-from backlash_ros.core.plant.filtering import lfilter
+from backlash_ros.core.plant.numerics import lfilter
 
 Array = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.law import Interval, Law
 from backlash_ros.core.plant.backlash import Backlash
 from backlash_ros.core.plant.noise_level import NoiseLevel
-from backlash_ros.core.plant.state_model import StateModel
+from backlash_ros.core.plant.transfer_function import StateModel
 
 Array = NDArray[np.float64]
 

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.model_check import check_model
-from backlash_ros.core.plant.state_model import StateModel
-from backlash_ros.core.plant.transfer_function import TransferFunction
+from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
 
 Array = NDArray[np.float64]
 

@@ -6,8 +6,7 @@ from records import resonance
 from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR
 
 from backlash_ros.core.estimation.observer import RATIOS, REGULAR, gain_of
-from backlash_ros.core.plant.state_model import StateModel
-from backlash_ros.core.plant.transfer_function import TransferFunction
+from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
 
 MODELS = {
     'resonance': StateModel(resonance()),

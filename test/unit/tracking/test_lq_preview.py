@@ -8,7 +8,7 @@ from strategies import plants
 
 from backlash_ros.core.control.tracking.design import power_gain
 from backlash_ros.core.control.tracking.lq_preview import PreviewGains, preview_gains
-from backlash_ros.core.plant.state_model import StateModel
+from backlash_ros.core.plant.transfer_function import StateModel
 
 
 def gains_of(

@@ -20,9 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.core.plant.riccati import riccati
-from backlash_ros.core.plant.state_model import StateModel
-from backlash_ros.core.plant.transfer_function import TransferFunction
+from backlash_ros.core.plant.numerics import riccati
+from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
 
 Array = NDArray[np.float64]
 

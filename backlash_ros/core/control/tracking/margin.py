@@ -8,8 +8,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.plant.riccati import riccati
-from backlash_ros.core.plant.state_model import StateModel
+from backlash_ros.core.plant.numerics import riccati
+from backlash_ros.core.plant.transfer_function import StateModel
 
 Array = NDArray[np.float64]
 

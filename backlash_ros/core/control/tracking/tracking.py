@@ -18,7 +18,7 @@ from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.law import StateSource
 from backlash_ros.core.plant.backlash import Region
 from backlash_ros.core.plant.noise_level import NoiseLevel
-from backlash_ros.core.plant.state_model import StateModel
+from backlash_ros.core.plant.transfer_function import StateModel
 
 # A better design takes over when v does not move much: samples after the first estimate, by then v
 # has crossed the gap with it; samples after a crossing, by then its last moves are over.
