@@ -23,7 +23,7 @@ def test_a_killed_worker_loses_no_run_and_no_bit_and_another_numpy_is_refused(
     remote, local = tmp_path / 'remote', tmp_path / 'local'
     # Nothing listens beyond this machine.
     with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, host='127.0.0.1', dashboard_address=None,
+        n_workers=1, threads_per_worker=1, host='127.0.0.1', dashboard_address=None,
         local_directory=str(tmp_path),
     ) as cluster, distributed.Client(cluster, set_as_default=False) as client:
         with monkeypatch.context() as other:
@@ -44,7 +44,7 @@ def test_a_killed_worker_loses_no_run_and_no_bit_and_another_numpy_is_refused(
             )
             os.kill(worker.pid, signal.SIGKILL)
             assert main([*RUNS, '--out', str(local)]) == 0
-            said, _ = simulation.communicate(timeout=DEADLINE_S)
+            said, _ = simulation.communicate(timeout=4.0 * DEADLINE_S)
         finally:
             simulation.kill()
             simulation.wait()

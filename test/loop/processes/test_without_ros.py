@@ -24,7 +24,6 @@ from backlash_ros.tools import report as report
 from backlash_ros.tools import simulate as simulate
 assert simulate.main(['--duration', '1', '--out', 'simulate']) == 0
 assert compare.main(['--duration', '1', '--out', 'compare']) == 0
-assert report.main(['simulate']) == 0
 """
 
 

@@ -19,7 +19,7 @@ from worker_jobs import checksum, foreign_modules, last_for_ever
 from backlash_ros.core.jobs.executor import LOST, Channel, ChannelSamples, Failure
 from backlash_ros.core.jobs.worker import WorkerExecutor
 
-KILLED = 6  # times
+KILLED = 3  # times
 PARENT = f"""
 import sys, time
 sys.path[:0] = [{str(ROOT)!r}, {str(ROOT / 'test')!r}]

@@ -95,8 +95,10 @@ def test_stick_and_slip_is_named() -> None:
     assert 'y sticks and slips' in named(observed(V, behind(sticking(V), 'gain'), 0.9))
 
 
-@pytest.mark.parametrize('plant', PLANTS)
-@pytest.mark.parametrize(('gap', 'noise'), [(0.0, NOISE), (0.05, NOISE), (GAP, NOISE), (GAP, 0.05)])
+@pytest.mark.parametrize(('plant', 'gap', 'noise'), [
+    *((plant, GAP, NOISE) for plant in PLANTS), ('gain', 0.05, NOISE), ('lag', 0.0, NOISE),
+    ('two lags', GAP, 0.05), ('integrator', 0.05, NOISE), ('resonance', 0.0, NOISE),
+])
 def test_a_play_is_nothing_else(plant: str, gap: float, noise: float) -> None:
     o = observed(V, behind(play(V, gap), plant, noise), gap, noise)
     assert what_it_is(o) is None
