@@ -18,7 +18,7 @@ setup(
     package_data={
         f'{PACKAGE}.middleware': ['loopback.xml', 'network.xml'],
         f'{PACKAGE}.nodes': ['live.html'],
-        f'{PACKAGE}.tools': ['page.html', 'figures.mplstyle'],
+        f'{PACKAGE}.tools': ['page.html', 'comparison.md', 'figures.mplstyle'],
     },
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),

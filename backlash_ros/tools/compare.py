@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Mapping, Sequence
+from pathlib import Path
+from string import Template
 from typing import NamedTuple
 
 import numpy as np
@@ -128,30 +130,16 @@ def _measure(
 
 def comparison_document(scenario: Parameters, results: Sequence[Result], figure: str) -> str:
     """docs/results/comparison.md as text."""
-    backlash = scenario.backlash
-    return '\n'.join([
-        '# Comparison of laws and structures', '',
-        f'![Control error and tracking error of every loop over time]({figure})', '',
-        '| ' + ' | '.join(COMPARISON_HEADER) + ' |', '|---' * len(COMPARISON_HEADER) + '|',
-        *('| ' + ' | '.join(result.row) + ' |' for result in results), '',
-        *(f'- {result.name}: {result.note}.' for result in results if result.note),
-        f'Scenario: the plant of the configuration, m = {backlash.m:g}, c_r = {backlash.c_r:g}, '
-        f'c_l = {backlash.c_l:g}, {scenario.waveform} at {scenario.frequency:g} rad/s, noise on y '
-        f'with standard deviation {scenario.output_noise_std:g}. Written by `compare --out '
-        'docs/results`; do not edit.',
-        '',
-        "- In the paper's structure y_m sets u_d, elsewhere y follows y_m scaled by |G| at its "
-        'frequency: every loop asks for about the same motion.',
-        '- Control error: RMS of u - u_d over the last second. Tracking error: relative RMS of '
-        'y - y_m with y_m delayed as the structure says, without the first fifth of the run. '
-        'Backlash penalty: what is left of it when the error of the same structure on a plant '
-        'without backlash is subtracted.',
-        '- Total variation of v: sum of |v(k) - v(k-1)| without the first fifth. Crossings: how '
-        'often v turns back by more than half of the gap, for each reversal of y_m.',
-        '- No compensation and wrong constants (the crossings 30 % too large) know the slope, '
-        'and have an observer that allows for a disturbance of u.',
-        '',
-    ])
+    template = Template(Path(__file__).with_name('comparison.md').read_text(encoding='utf-8'))
+    numbers = {'frequency': scenario.frequency, 'noise': scenario.output_noise_std,
+               **vars(scenario.backlash)}
+    return template.substitute(
+        {name: f'{value:g}' for name, value in numbers.items() if isinstance(value, float)},
+        figure=figure, waveform=scenario.waveform, header=' | '.join(COMPARISON_HEADER),
+        rule='|---' * len(COMPARISON_HEADER),
+        rows='\n'.join(f'| {" | ".join(result.row)} |' for result in results),
+        notes=''.join(f'- {result.name}: {result.note}.\n' for result in results if result.note),
+    )
 
 
 def make_parser() -> argparse.ArgumentParser:
