@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections import Counter
+from functools import partial
 from math import inf, isfinite
 from typing import Any
 
@@ -209,9 +210,7 @@ class PlantNode(ProcessNode):
             })
 
 
-def main(args: list[str] | None = None) -> int:
-    return run(PLANT, PlantNode, args)
-
+main = partial(run, PLANT, PlantNode)
 
 if __name__ == '__main__':
     sys.exit(main())

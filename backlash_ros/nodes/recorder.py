@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import signal
 import sys
 import time
@@ -233,17 +232,15 @@ class RecorderNode(ProcessNode):
 
 def main(args: list[str] | None = None) -> int:
     """Entry point; returns the exit code: 1 if the recording stopped before its time."""
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    parser.add_argument('--repair', type=Path, metavar='BAG')
-    try:
-        options, others = parser.parse_known_args(args)
-    except argparse.ArgumentError:
-        print(f'{RECORDER}: --repair needs the folder of a bag', file=sys.stderr)
-        return BAD_INPUT
-    if options.repair is not None and not others:
+    arguments = sys.argv[1:] if args is None else args
+    if arguments[:1] == ['--repair']:
+        if len(arguments) != 2:
+            print(f'{RECORDER}: --repair needs the folder of a bag, and nothing else',
+                  file=sys.stderr)
+            return BAD_INPUT
         signal.signal(signal.SIGTERM, signal.default_int_handler)
-        return repair_command(options.repair)
-    if {'-h', '--help'} & set(others):
+        return repair_command(Path(arguments[1]))
+    if {'-h', '--help'} & set(arguments):
         print(f'{RECORDER} --repair BAG: make a bag readable that was never closed, or is damaged')
     return run(RECORDER, RecorderNode, args)
 

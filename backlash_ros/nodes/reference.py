@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Mapping
+from functools import partial
 from math import inf
 from typing import Any
 
@@ -152,9 +153,7 @@ class ReferenceNode(ProcessNode):
         self._output.publish(messages.message_with(y_m))
 
 
-def main(args: list[str] | None = None) -> int:
-    return run(REFERENCE_NODE, ReferenceNode, args)
-
+main = partial(run, REFERENCE_NODE, ReferenceNode)
 
 if __name__ == '__main__':
     sys.exit(main())

@@ -141,7 +141,9 @@ class ProcessNode(ParameterNode):
         timer = self.create_timer(0.01, look, clock=self.steady_clock)
 
 
-def run(executable: str, make_node: Callable[[], ProcessNode], args: list[str] | None) -> int:
+def run(
+    executable: str, make_node: Callable[[], ProcessNode], args: list[str] | None = None,
+) -> int:
     """Run a node until its work ends, by itself or by SIGINT or SIGTERM; return the exit code.
 
     That of the node, or 2 for bad input, told in one line on stderr. Any other exception passes.
