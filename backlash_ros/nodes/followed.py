@@ -159,10 +159,11 @@ class FollowedControllers:
 
     def _look(self) -> None:
         """Whoever publishes what a controller publishes is one."""
+        wanted = tuple(f'{name.rstrip("/")}/' for name in self._wanted) or '/'
         for topic, _ in sorted(self._node.get_topic_names_and_types()):
             # By this a controller is known, or a joint of it.
             found = re.fullmatch(rf'(?P<node>.*)/watch/((?P<joint>[^/]+)/)?{BACKLASH[0]}', topic)
-            if found is None or not self._is_wanted(found['node']):
+            if found is None or not f'{found["node"]}/'.startswith(wanted):
                 continue
             state = ControllerState(found['node'], found['joint'] or '')
             if state.name not in self.by_name:
@@ -172,11 +173,6 @@ class FollowedControllers:
                     polled=True,
                 ) for label in self._labels]
                 self.by_name[state.name] = state
-
-    def _is_wanted(self, name: str) -> bool:
-        return not self._wanted or any(
-            name == wanted or name.startswith(f'{wanted.rstrip("/")}/') for wanted in self._wanted
-        )
 
 
 def viewer_options(name: str, description: str | None, epilog: str) -> OptionParser:
