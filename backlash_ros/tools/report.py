@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core.parameters import Parameters
@@ -19,6 +18,7 @@ from backlash_ros.options import OptionParser
 from backlash_ros.tools import cli, figures
 from backlash_ros.tools.cli import NOTHING, number
 from backlash_ros.tools.config import write_config
+from backlash_ros.tools.figures import png
 from backlash_ros.tools.page import Picture, facts, page, table
 from backlash_ros.tools.records.columns import parse_columns
 from backlash_ros.tools.records.reading import read_run_or_log
@@ -54,10 +54,7 @@ def write_report(run: files.Run, out: Path) -> dict[str, Any]:
     if run.parameters is not None:
         write_config(run.parameters, out / files.CONFIG_FILE)
         folded = ('Parameters of this run', (out / files.CONFIG_FILE).read_text(encoding='utf-8'))
-    pictures = [
-        Picture(name, heading, caption, figures.png(figure))
-        for name, heading, caption, figure in _figures(run.record, run.parameters, summary)
-    ]
+    pictures = list(_figures(run.record, run.parameters, summary))
     for picture in pictures:
         write_atomically(out / picture.name, picture.data)
     write_atomically(out / REPORT_PAGE, page(
@@ -69,69 +66,69 @@ def write_report(run: files.Run, out: Path) -> dict[str, Any]:
 
 def _figures(
     run: RunRecord, parameters: Parameters | None, summary: Mapping[str, Any],
-) -> Iterator[tuple[str, str, str, Figure]]:
-    """File, heading, caption (HTML) and figure of all that this run allows, in their order."""
+) -> Iterator[Picture]:
+    """The figures of all that this run allows, in their order."""
     if not np.isfinite(run.column('m')).any():
-        yield (
+        yield Picture(
             'log.png', 'v and y', 'What the log holds, as it was read. With play, y over v is a '
             'loop with level stretches, as wide as the gap, where v turns.',
-            figures.draw_log(run),
+            png(figures.draw_log(run)),
         )
         return
     start, end = parts = told.interesting_parts(run, parameters)
     if run.has_truth:
-        yield (
+        yield Picture(
             'parameter_errors.png', 'Parameter errors over time (Figure 4 of the paper)',
             'How far the estimates are from the hidden backlash, and in percent of it. A dot marks '
             'the time from which the error stays within 1 %.',
-            figures.draw_parameter_errors(run, start, summary['settling_time_s']),
+            png(figures.draw_parameter_errors(run, start, summary['settling_time_s'])),
         )
-    yield (
+    yield Picture(
         'estimates.png', 'Estimates over time',
         'What the controller has learned from v and y alone; a band shows how sure it is where '
-        'the law knows.', figures.draw_estimates(run),
+        'the law knows.', png(figures.draw_estimates(run)),
     )
-    if np.isfinite(run.column('u')).any():
-        error = told.control_error(run)
-        yield (
+    error, innovation = told.control_error(run), run.column('innovation')
+    if np.isfinite(error).any():
+        yield Picture(
             'control_error.png', 'Control error of this run',
             'e = u − u<sub>d</sub> (3.4): what the inverse leaves of the backlash.',
-            figures.draw_closer(run, error, '$u - u_d$ [unit of u]', parts),
+            png(figures.draw_closer(run, error, '$u - u_d$ [unit of u]', parts)),
         )
-    elif np.isfinite(run.column('innovation')).any():
-        yield (
+    elif np.isfinite(innovation).any():
+        yield Picture(
             'innovation.png', 'Innovation',
             'y minus its prediction. White and small: the model explains the plant.',
-            figures.draw_closer(run, run.column('innovation'), r'$y - \hat{y}$ [unit of y]', parts),
+            png(figures.draw_closer(run, innovation, r'$y - \hat{y}$ [unit of y]', parts)),
         )
     if run.has_truth and parameters is not None:
         duration = told.compared_samples(run) * run.sample_period
         curves, window_s, notes = told.compare_laws(run, parameters)
-        yield (
+        yield Picture(
             'laws.png', 'Control error of the laws (Figure 5 of the paper)',
             'This run beside the other laws, simulated with the same parameters, over the first '
             f'{duration:.6g} s.' + ''.join(f' Without a curve: {escape(note)}.' for note in notes),
-            figures.draw_error_curves(curves, window_s),
+            png(figures.draw_error_curves(curves, window_s)),
         )
-    yield (
+    yield Picture(
         'hysteresis.png', 'Backlash: the v–u loop',
         'u follows the right line going up, the left line going down, and is held between them. '
         'Where a dashed line lies on the wide one, the estimate is right.' if run.has_truth else
         'The loop as the last estimates see it: u itself was not measured.',
-        figures.draw_hysteresis(run, end),
+        png(figures.draw_hysteresis(run, end)),
     )
     y_m, delay, followed = told.followed_reference(run, parameters)
-    yield (
+    yield Picture(
         'output.png', 'Reference and output',
         'y follows y<sub>m</sub>.' if followed else
         'Each on its own scale: y does not follow y<sub>m</sub>, nor does the structure '
         'u<sub>d</sub> = y<sub>m</sub> + f v aim at that.',
-        figures.draw_output(run, end, y_m, delay, followed),
+        png(figures.draw_output(run, end, y_m, delay, followed)),
     )
-    yield (
+    yield Picture(
         'input.png', 'Desired input and control',
         'v jumps by the width of the gap whenever u<sub>d</sub> turns.',
-        figures.draw_input(run, parts),
+        png(figures.draw_input(run, parts)),
     )
 
 

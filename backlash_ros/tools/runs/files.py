@@ -25,10 +25,7 @@ from backlash_ros.tools.cli import InputError
 
 SAMPLES_FILE, RECORD_FILE = 'samples.csv', 'record.npz'
 CONFIG_FILE = 'parameters.yaml'
-SAMPLE_COLUMNS = (
-    't', 'y_m', 'y', 'u_d', 'v', 'u', 'm', 'c_r', 'c_l', 'f', 'std_m', 'std_c_r', 'std_c_l',
-    'status',
-)
+SAMPLE_COLUMNS = (*COLUMNS[:COLUMNS.index('u_hat')], 'status')
 
 
 @dataclass(frozen=True)
