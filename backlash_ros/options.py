@@ -31,3 +31,23 @@ def positive(text: str) -> float:
     if not 0.0 < number < inf:
         raise argparse.ArgumentTypeError(f'{text} must be finite and > 0')
     return number
+
+
+def add_motion_options(
+    parser: argparse.ArgumentParser | argparse._ArgumentGroup, duration_s: float, what: str,
+) -> None:
+    """Add what those who listen to a driver, or move it, have to know besides --drive.
+
+    what: --duration is, with its default duration_s.
+    """
+    for name, default, unit, text in (
+        ('duration', duration_s, 'SECONDS', f'{what} (default: {duration_s:g})'),
+        ('wait', 10.0, 'SECONDS', 'how long to wait for a driver (default: 10)'),
+        ('rest', 30.0, 'SECONDS', 'drive: longest way to rest at the end, after which v is held '
+         '(default: 30); a signal on that way holds v at once'),
+        ('amplitude', None, 'V', 'drive: keep v within ±V as well'),
+        ('rate', None, 'V_PER_S', 'drive: keep v slower than this as well'),
+    ):
+        parser.add_argument(f'--{name}', type=positive, default=default, metavar=unit, help=text)
+    parser.add_argument('--output-range', type=float, nargs=2, metavar=('LOW', 'HIGH'),
+                        help='drive: stop when y leaves this range')

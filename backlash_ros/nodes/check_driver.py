@@ -15,19 +15,17 @@ from rclpy.utilities import remove_ros_args
 from backlash_ros.core.driver_check.drive import waves
 from backlash_ros.core.driver_check.heard import timing_of
 from backlash_ros.core.driver_check.verdict import WRONG, Judgement, all_fit, judge, table
-from backlash_ros.nodes.drive.motion_node import MotionNode, add_motion_options
+from backlash_ros.nodes.drive.motion_node import MotionNode
 from backlash_ros.nodes.runtime.process import ros_arguments, run
-from backlash_ros.options import DONE, FAILED, OptionParser
+from backlash_ros.options import DONE, FAILED, OptionParser, add_motion_options
 from backlash_ros.shipped import find_config
-
-CHECK_DRIVER = 'check_driver'
 
 
 class CheckDriverNode(MotionNode):
     """Judges what it hears."""
 
     def __init__(self, options: argparse.Namespace) -> None:
-        super().__init__(CHECK_DRIVER, options, waves)
+        super().__init__('check_driver', options, waves)
 
     def tell(self) -> None:
         findings = judge(self.graph.in_the_end(), self.heard, self.settings)
@@ -43,8 +41,7 @@ class CheckDriverNode(MotionNode):
 
     def _save(self, path: Path) -> None:
         timing = timing_of(self.heard, self.settings.sample_period)
-        acted = timing.v_acted(self.heard.applied, True)
-        acted = timing.v_acted(self.heard.controls, False) if acted is None else acted
+        acted = timing.v_acted(self.heard)
         if acted is None:
             self.say(f'nothing to save in {path}: v and y were not both heard')
             return
@@ -60,16 +57,14 @@ class CheckDriverNode(MotionNode):
 
 def parse_options(plain: Sequence[str]) -> argparse.Namespace:
     """Options besides those of ROS."""
-    parser = OptionParser(
-        CHECK_DRIVER, description=__doc__,
-        epilog='Exit codes: 0 all fits, 1 something does not, 2 bad input.',
-    )
+    parser = OptionParser('check_driver', description=__doc__,
+                          epilog='Exit codes: 0 all fits, 1 something does not, 2 bad input.')
     parser.add_argument('--config', metavar='FILE', help='ROS 2 parameter file of the controller, '
                         'or the name of a shipped one')
     parser.add_argument('--drive', action='store_true', help='move v, to and fro within '
                         'control.min, control.max and control.rate_max, to rest at the end')
     parser.add_argument('--save', type=Path, metavar='FILE', help='write t,v,y as CSV')
-    add_motion_options(parser)
+    add_motion_options(parser, 10.0, 'how long to listen')
     options = parser.parse_args(plain)
     for name in ('amplitude', 'rate'):
         if getattr(options, name) is not None and not options.drive:
@@ -102,7 +97,7 @@ def main(args: list[str] | None = None) -> int:
             config = str(find_config(Path(options.config)))
             for file in reversed(parameter_files(config, Path(folder))):
                 given = ['--ros-args', '--params-file', file, *given]
-        return run(CHECK_DRIVER, lambda: CheckDriverNode(options), given)
+        return run('check_driver', lambda: CheckDriverNode(options), given)
 
 
 if __name__ == '__main__':

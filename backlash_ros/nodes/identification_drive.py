@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections import Counter
 from pathlib import Path
 
 from rclpy.utilities import remove_ros_args
 
 from backlash_ros import topics
 from backlash_ros.core.identification.motion import strokes
-from backlash_ros.nodes.drive.motion_node import MotionNode, add_motion_options
+from backlash_ros.nodes.drive.motion_node import MotionNode
 from backlash_ros.nodes.runtime.process import ros_arguments, run
-from backlash_ros.options import DONE, FAILED
-
-IDENTIFY = 'identify'
+from backlash_ros.options import DONE, FAILED, add_motion_options
 
 
 class IdentificationDriveNode(MotionNode):
@@ -24,20 +23,15 @@ class IdentificationDriveNode(MotionNode):
     """
 
     def __init__(self, options: argparse.Namespace) -> None:
-        super().__init__(IDENTIFY, options, strokes)
+        super().__init__('identify', options, strokes)
         self._file = options.messages.open('w', encoding='ascii')
-        self._written = {topics.CONTROL: 0, topics.APPLIED_CONTROL: 0, topics.PLANT_OUTPUT: 0}
+        self._written = Counter[str]()
 
     def look(self) -> None:
         super().look()
-        heard = self.heard
-        for topic, messages in zip(
-            self._written, (heard.controls, heard.applied, heard.outputs), strict=True
-        ):
-            self._file.writelines(
-                f'{topic},{message.stamp_ns},{message.value!r}\n'
-                for message in messages[self._written[topic]:]
-            )
+        for topic, messages in self.heard.by_topic.items():
+            for message in messages[self._written[topic]:]:
+                print(topic, message.stamp_ns, repr(message.value), sep=',', file=self._file)
             self._written[topic] = len(messages)
         self._file.flush()
 
@@ -55,16 +49,14 @@ class IdentificationDriveNode(MotionNode):
 def main(args: list[str] | None = None) -> int:
     """Entry point; returns the exit code. The options are those that `identify` has checked."""
     arguments = sys.argv[1:] if args is None else args
-    parser = argparse.ArgumentParser(prog=IDENTIFY)
+    parser = argparse.ArgumentParser(prog='identify')
     parser.set_defaults(drive=True)
     parser.add_argument('--messages', type=Path, required=True)
     parser.add_argument('--config', required=True)
-    add_motion_options(parser)
+    add_motion_options(parser, 10.0, 'how long to listen')
     options = parser.parse_args(remove_ros_args(['', *arguments])[1:])
-    return run(
-        IDENTIFY, lambda: IdentificationDriveNode(options),
-        ['--ros-args', '--params-file', options.config, *ros_arguments(arguments)],
-    )
+    return run('identify', lambda: IdentificationDriveNode(options),
+               ['--ros-args', '--params-file', options.config, *ros_arguments(arguments)])
 
 
 if __name__ == '__main__':

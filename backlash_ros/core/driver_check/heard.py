@@ -58,6 +58,12 @@ class Heard:
     applied: list[Message] = field(default_factory=list)
     end_ns: int = 0
 
+    @property
+    def by_topic(self) -> dict[str, list[Message]]:
+        """The lists, which grow, by their topics."""
+        return {'plant_output': self.outputs, 'control': self.controls,
+                'applied_control': self.applied}
+
 
 class Timing(NamedTuple):
     """Samples without repetitions: their messages, their count from 0, and the period found.
@@ -76,7 +82,12 @@ class Timing(NamedTuple):
     lateness: float = 0.0
     fits: bool = True
 
-    def v_acted(self, messages: Sequence[Message], reported: bool) -> Array | None:
+    def v_acted(self, heard: Heard) -> Array | None:
+        """v over each sample interval (N,) as it is reported, or else as it was commanded."""
+        applied = self.v_of(heard.applied, True)
+        return self.v_of(heard.controls, False) if applied is None else applied
+
+    def v_of(self, messages: Sequence[Message], reported: bool) -> Array | None:
         """v over each sample interval (N,), nan before any; None where nothing tells it.
 
         reported: whether the messages are those of applied_control.

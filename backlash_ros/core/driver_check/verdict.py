@@ -91,13 +91,12 @@ def judge(graph: Graph, heard: Heard, p: Parameters) -> list[Judgement]:
     if not graph.publishers:
         return [Judgement('publisher', WRONG, 'nobody publishes plant_output', 'start the driver')]
     verdict, timing = Verdict(), timing_of(heard, p.sample_period)
-    control, applied = timing.v_acted(heard.controls, False), timing.v_acted(heard.applied, True)
     _judge_graph(verdict, graph, p)
     if 'rate' not in verdict.lines:
         _judge_messages(verdict, heard, timing, p)
-    lag = _judge_reports(verdict, heard, timing, control, applied, p)
+    lag = _judge_reports(verdict, heard, timing, p)
     if 'backlash' not in verdict.lines:
-        _judge_motion(verdict, timing, control if applied is None else applied, lag, p)
+        _judge_motion(verdict, timing, timing.v_acted(heard), lag, p)
     return [verdict.lines[subject] for subject in ORDER if subject in verdict.lines]
 
 
@@ -163,19 +162,16 @@ def _judge_messages(verdict: Verdict, heard: Heard, timing: Timing, p: Parameter
         'synchronise the clocks of both machines (chrony, PTP), or look for a slow network', MOTION)
     verdict.fits('clock', age)
     counts = {topic: sum(not plausible(message.value) for message in messages)
-              for topic, messages in (('plant_output', heard.outputs), ('control', heard.controls),
-                                      ('applied_control', heard.applied))}
+              for topic, messages in heard.by_topic.items()}
     absurd = ', '.join(f'{count} on {topic}' for topic, count in counts.items() if count)
     verdict.check('values', absurd, f'nan, inf or absurd: {absurd}',
                   'publish nothing where the sensor has no value; the controller steps over it')
     verdict.fits('values', 'all finite')
 
 
-def _judge_reports(
-    verdict: Verdict, heard: Heard, timing: Timing, control: Array | None, applied: Array | None,
-    p: Parameters,
-) -> int:
+def _judge_reports(verdict: Verdict, heard: Heard, timing: Timing, p: Parameters) -> int:
     """Judge applied_control; return the samples by which it follows control."""
+    control, applied = timing.v_of(heard.controls, False), timing.v_of(heard.applied, True)
     cure = 'report v just before each y, or set estimator.use_applied_control: false'
     use, lag, limited_by = report_use(p), 0, 0.0
     if control is not None and applied is not None:

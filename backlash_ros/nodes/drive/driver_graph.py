@@ -26,10 +26,8 @@ class DriverGraph:
 
     def publishers(self, topic: str) -> list[TopicEndpointInfo]:
         """Who else publishes a topic."""
-        return [
-            info for info in self._node.get_publishers_info_by_topic(self._names[topic])
-            if info.node_name != self._node.get_name()
-        ]
+        return [info for info in self._node.get_publishers_info_by_topic(self._names[topic])
+                if info.node_name != self._node.get_name()]
 
     def rivals(self) -> str:
         """Who else publishes v, empty for nobody."""
@@ -37,10 +35,9 @@ class DriverGraph:
 
     def profile(self, topic: str) -> QoSProfile:
         """The QoS that hears whoever publishes a topic."""
-        return QoSProfile(depth=DEPTH, reliability=(
-            ReliabilityPolicy.BEST_EFFORT if _has_best_effort(self.publishers(topic))
-            else ReliabilityPolicy.RELIABLE
-        ))
+        best_effort = _has_best_effort(self.publishers(topic))
+        return QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT if best_effort
+                          else ReliabilityPolicy.RELIABLE)
 
     def look(self) -> None:
         """Take note of who is there now."""
@@ -77,18 +74,14 @@ class DriverGraph:
 
     def _topics(self, endpoints: Callable[[str], list[TopicEndpointInfo]]) -> dict[str, list[str]]:
         """Topics that others have such endpoints of, with their types, but for those of ROS."""
-        return {
-            topic: types for topic, types in self._node.get_topic_names_and_types()
-            if topic not in ('/rosout', '/parameter_events') and self._others(endpoints(topic))
-        }
+        return {topic: types for topic, types in self._node.get_topic_names_and_types()
+                if topic not in ('/rosout', '/parameter_events') and self._others(endpoints(topic))}
 
     def _others(self, endpoints: Sequence[TopicEndpointInfo]) -> list[TopicEndpointInfo]:
         """Without those of this node, of the recorder and of `ros2 topic`."""
         own = (self._node.get_name(), RECORDER)
-        return [
-            info for info in endpoints
-            if info.node_name not in own and not info.node_name.startswith('_ros2cli')
-        ]
+        return [info for info in endpoints
+                if info.node_name not in own and not info.node_name.startswith('_ros2cli')]
 
 
 def _has_best_effort(endpoints: Sequence[TopicEndpointInfo]) -> bool:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Callable
 from functools import partial
 from math import inf
 from typing import Any
@@ -25,27 +24,9 @@ from backlash_ros.nodes.drive.driver_graph import DriverGraph
 from backlash_ros.nodes.runtime.executor import PromptExecutor
 from backlash_ros.nodes.runtime.messages import DEPTH
 from backlash_ros.nodes.runtime.process import ProcessNode
-from backlash_ros.options import BAD_INPUT, FAILED, positive
+from backlash_ros.options import BAD_INPUT, FAILED
 
 LOOK_S = 0.1  # between two looks at the graph
-
-
-def add_motion_options(parser: argparse.ArgumentParser) -> None:
-    """Add what a MotionNode has to know besides --drive."""
-    for name, default, what in (
-        ('duration', 10.0, 'how long to listen (default: 10)'),
-        ('wait', 10.0, 'how long to wait for a driver (default: 10)'),
-        ('rest', 30.0, 'drive: longest way to rest at the end, after which v is held (default: 30);'
-         ' a signal on that way holds v at once'),
-    ):
-        parser.add_argument(f'--{name}', type=positive, default=default, metavar='SECONDS',
-                            help=what)
-    parser.add_argument('--amplitude', type=positive, metavar='V',
-                        help='drive: keep v within ±V as well')
-    parser.add_argument('--rate', type=positive, metavar='V_PER_S',
-                        help='drive: keep v slower than this as well')
-    parser.add_argument('--output-range', type=float, nargs=2, default=(-inf, inf),
-                        metavar=('LOW', 'HIGH'), help='drive: stop when y leaves this range')
 
 
 class MotionNode(ProcessNode):
@@ -69,10 +50,7 @@ class MotionNode(ProcessNode):
         self.heard = Heard()
         self.motion: Drive | None = None
         self.ended, self.exit_code = '', FAILED
-        self.names = {
-            topic: self.resolve_topic_name(topic)
-            for topic in (topics.PLANT_OUTPUT, topics.CONTROL, topics.APPLIED_CONTROL)
-        }
+        self.names = {topic: self.resolve_topic_name(topic) for topic in self.heard.by_topic}
         self.graph = DriverGraph(self, self.names)
         self._driving, self._rivals = False, ''
 
@@ -87,10 +65,8 @@ class MotionNode(ProcessNode):
             finally:
                 self._come_to_rest()
         if self._rivals:
-            self.say(
-                f'{self.names[topics.CONTROL]} is published by {self._rivals}: '
-                'stop that first, or leave --drive out'
-            )
+            self.say(f'{self.names[topics.CONTROL]} is published by {self._rivals}: stop that '
+                     'first, or leave --drive out')
             self.exit_code = BAD_INPUT
         else:
             self.tell()
@@ -122,19 +98,16 @@ class MotionNode(ProcessNode):
     def _follow(self, executor: PromptExecutor) -> None:
         """Listen for the duration; drive for as many samples as it has, late ones as well."""
         settle_s = 1.0  # after which everybody should have found everybody
-        self._hear(topics.APPLIED_CONTROL, self.heard.applied.append)
-        if self.options.drive:
+        driving, p = self.options.drive, self.settings
+        self._hear(topics.APPLIED_CONTROL)
+        if driving:
             control = self.names[topics.CONTROL]
-            self._presence = Presence(
-                self.context.get_domain_id(), control,
-                identity_made_by(self, control, self._advertise),
-            )
+            self._presence = Presence(self.context.get_domain_id(), control,
+                                      identity_made_by(self, control, self._advertise))
         else:
-            self._hear(topics.CONTROL, self.heard.controls.append)
-        self._hear(topics.PLANT_OUTPUT, self._on_output)
+            self._hear(topics.CONTROL)
+        self._hear(topics.PLANT_OUTPUT)
         begin = looked = time.monotonic()
-        p = self.settings
-        driving = self.options.drive
         enough = self.options.duration / p.sample_period if driving else inf
         end = begin + (2.0 * self.options.duration + settle_s if driving else self.options.duration)
         patience = max(p.timeout.plant_output, 10.0 * p.sample_period)
@@ -148,7 +121,7 @@ class MotionNode(ProcessNode):
             if now > looked + LOOK_S:
                 looked = now
                 self.look()
-                if self.options.drive and now > begin + settle_s:
+                if driving and now > begin + settle_s:
                     if self._presence.others():
                         self._rivals = self._rivals or 'a controller of this machine'
                     self._driving = self._control.get_subscription_count() > 0
@@ -162,23 +135,23 @@ class MotionNode(ProcessNode):
         self._control: Publisher = self.create_publisher(Float64, topics.CONTROL, DEPTH)
         return self._control
 
-    def _hear(self, topic: str, take: Callable[[Message], None]) -> None:
+    def _hear(self, topic: str) -> None:
         """Subscribe the way that hears whoever publishes, whatever the QoS."""
         def on_message(message: Float64, info: dict[str, Any]) -> None:
-            take(Message(
+            self.heard.by_topic[topic].append(Message(
                 message.data, info['source_timestamp'], info['received_timestamp'],
-                info['publication_sequence_number'],
-            ))
+                info['publication_sequence_number']))
+            if topic == topics.PLANT_OUTPUT and self._driving and not self._rivals:
+                self._answer(message.data)
 
         self.listen(Float64, topic, on_message, self.graph.profile(topic))
 
-    def _on_output(self, output: Message) -> None:
-        self.heard.outputs.append(output)
-        if not self._driving or self._rivals or self.ended:
-            return
-        low, high = self.options.output_range
-        if plausible(output.value) and not low <= output.value <= high:
-            self.ended = f'y = {output.value:.4g} left --output-range'
+    def _answer(self, y: float) -> None:
+        """Move v on by a sample, unless the motion has ended."""
+        low, high = self.options.output_range or (-inf, inf)
+        if plausible(y) and not low <= y <= high:
+            self.ended = self.ended or f'y = {y:.4g} left --output-range'
+        if self.ended:
             return
         if self.motion is None:
             self.motion = self._begin(self._v_at_start())
@@ -194,10 +167,8 @@ class MotionNode(ProcessNode):
         if reported and plausible(reported[0]):
             return build_limits(self.settings).go_on_from(reported[0], known)
         if known is None:
-            self.say(
-                'nobody says which v acts now, so the drive goes on from 0: '
-                f'publish {topics.APPLIED_CONTROL}, or set control.initial'
-            )
+            self.say('nobody says which v acts now, so the drive goes on from 0: publish '
+                     f'{topics.APPLIED_CONTROL}, or set control.initial')
         return known or 0.0
 
     def _come_to_rest(self) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from backlash_ros.core.parameters.parameter import Value
-from backlash_ros.options import FAILED, OptionParser, positive
+from backlash_ros.options import FAILED, OptionParser, add_motion_options, positive
 from backlash_ros.tools.cli import add_options, run_tool, span_of
 from backlash_ros.tools.records.columns import parse_columns
 
@@ -46,20 +46,10 @@ def make_parser() -> argparse.ArgumentParser:
     drive.add_argument('--drive', action='store_true',
                        help='move the actuator within control.min, control.max and '
                             'control.rate_max of --config, record, bring it to rest, identify')
-    drive.add_argument('--duration', type=positive, metavar='S', default=20.0,
-                       help='longest motion [s] (default: 20)')
     drive.add_argument('--precision', type=_share, default=0.0, metavar='P%',
                        help='end the motion as soon as gap and G are known to this (default: 0, '
                             'the whole duration)')
-    drive.add_argument('--amplitude', type=positive, metavar='V', help='keep v within ±V as well')
-    drive.add_argument('--rate', type=positive, metavar='V_PER_S',
-                       help='keep v slower than this as well')
-    drive.add_argument('--output-range', type=float, nargs=2, metavar=('LOW', 'HIGH'),
-                       help='end the motion when y leaves this range')
-    drive.add_argument('--wait', type=positive, default=10.0, metavar='S',
-                       help='how long to wait for a driver (default: 10)')
-    drive.add_argument('--rest', type=positive, default=30.0, metavar='S',
-                       help='longest way to rest at the end (default: 30)')
+    add_motion_options(drive, 20.0, 'longest motion')
     return parser
 
 
