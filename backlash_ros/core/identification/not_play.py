@@ -47,6 +47,12 @@ class Observed:
         return float(np.nanmax(self.y) - np.nanmin(self.y))
 
     @property
+    def along(self) -> float:
+        """Correlation of v and y: about 1 or -1, but next to 0 where G integrates."""
+        known = np.isfinite(self.y)
+        return float(np.corrcoef(self.v[known], self.y[known])[0, 1])
+
+    @property
     def unexplained(self) -> bool:
         """Whether the residual is more than noise."""
         left = float(np.sqrt(np.nanmean(self.residual**2)))
@@ -85,26 +91,33 @@ class Answer(NamedTuple):
 
 
 def saturation(o: Observed) -> Figures:
-    """Play, then a y that goes on no further while v does."""
-    known = np.flatnonzero(np.isfinite(o.y))
-    y, v = o.y[known], o.v[known]
-    bottom, top = np.percentile(y, [3.0, 97.0]).tolist()
-    along = float(np.corrcoef(v, y)[0, 1]) if np.ptp(v) > 0.0 and top > bottom else 0.0
-    # Of a G that integrates, y is at its end where v is in its middle.
-    if abs(along) < 0.3 or np.sqrt(np.nanmean(o.residual**2)) < 0.05 * (top - bottom):
+    """Play, then a load, or a sensor, that goes on no further while v does."""
+    family = o.family
+    if family is None:
         return None
-    on: list[float] = []
-    at_end = 0
-    for end, way in ((top, along), (bottom, -along)):
-        runs = [run for run in _runs(np.abs(y - end) < 0.12 * (top - bottom)) if len(run) > 5]
-        of_side = [float(np.max((v[run] - v[run[0]]) * np.sign(way))) for run in runs]
-        on += of_side
-        at_end += sum(len(run) - 1 for run in runs)
-        for beyond in (of_side, on):
-            far = [size for size in beyond if size > 0.15 * np.ptp(v)]
-            if len(far) >= max(4.0, 0.5 * len(beyond) + 0.5) and at_end > 0.15 * len(y):
-                return {'end': end, 'on': float(np.median(far))}
-    return None
+    v, far = family.v, 0.1 * float(np.ptp(family.v))
+    for of_sensor, way in ((np.nanpercentile(o.y, 98.0), 1.0), (np.nanpercentile(o.y, 2.0), -1.0)):
+        runs = _runs(np.abs(o.y - of_sensor) < 4.0 * o.noise + 0.005 * o.swing)
+        on = [float(np.max((o.v[run] - o.v[run[0]]) * way * np.sign(o.along))) for run in runs]
+        if abs(o.along) > 0.3 and sum(size > far for size in on) >= 3:
+            return {'end': float(of_sensor), 'on': max(on)}
+
+    def ended(width: float, low: float, high: float) -> Array:
+        return np.clip(family.play(width), low, high)
+
+    starts = [(width, float(v.min()) + 10.0 * low * far, float(v.min()) + 10.0 * high * far)
+              for width in (o.one_play.at[0], 0.0)
+              for low, high in ((-1.0, 0.75), (0.25, 2.0), (0.2, 0.8), (0.35, 0.65))]
+    found = family.best(ended, starts)
+    if not family.beats(found, o.one_play, o.noise, 0.6):
+        return None
+    width, low, high = found.at
+    p = family.play(width)
+    beyond = np.maximum(p - high, low - p)
+    there = beyond[family.rows] > 0.0
+    if not beyond.max() > far or not there.any():
+        return None
+    return {'end': float(np.median(family.target[there])), 'on': float(beyond.max())}
 
 
 def pushed(o: Observed) -> Figures:
