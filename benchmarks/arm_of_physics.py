@@ -33,8 +33,7 @@ from arm_physics import JOINTS, RESOLUTION, ArmPhysics, Joint
 from joint_trajectory import swing
 
 from backlash_ros.core.assembly import first_guess, known_before
-from backlash_ros.core.driver_check.drive import Drive, drive_range
-from backlash_ros.core.identification.motion import strokes
+from backlash_ros.core.identification.motion import Drive, drive_range, strokes
 from backlash_ros.core.loop.control_loop import Driver
 from backlash_ros.core.loop.joint_loops import JointLoops
 from backlash_ros.core.loop.sample_counter import Output, SampleCounter

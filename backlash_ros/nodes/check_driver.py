@@ -12,9 +12,9 @@ import numpy as np
 import yaml
 from rclpy.utilities import remove_ros_args
 
-from backlash_ros.core.driver_check.drive import waves
 from backlash_ros.core.driver_check.heard import timing_of
 from backlash_ros.core.driver_check.verdict import WRONG, Judgement, all_fit, judge, table
+from backlash_ros.core.identification.motion import waves
 from backlash_ros.nodes.drive.motion_node import MotionNode
 from backlash_ros.nodes.runtime.process import ros_arguments, run
 from backlash_ros.options import DONE, FAILED, OptionParser, add_motion_options

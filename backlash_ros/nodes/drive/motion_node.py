@@ -16,8 +16,8 @@ from std_msgs.msg import Float64
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_controller, build_limits
 from backlash_ros.core.control.limits import plausible
-from backlash_ros.core.driver_check.drive import Drive, Motion, drive_range
 from backlash_ros.core.driver_check.heard import Heard, Message
+from backlash_ros.core.identification.motion import Drive, Motion, drive_range
 from backlash_ros.core.parameters.table import CONTROLLER
 from backlash_ros.nodes.control.rivals import Presence, identity_made_by
 from backlash_ros.nodes.drive.driver_graph import DriverGraph

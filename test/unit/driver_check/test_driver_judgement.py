@@ -20,10 +20,9 @@ from drivers.made_up_driver import (
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from backlash_ros.core.driver_check.drive import Drive, Range, drive_range, waves
 from backlash_ros.core.driver_check.heard import Heard, Message
 from backlash_ros.core.driver_check.verdict import FLOAT64, UNKNOWN, all_fit, judge, table
-from backlash_ros.core.identification.motion import strokes
+from backlash_ros.core.identification.motion import Drive, Range, drive_range, strokes, waves
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.transfer_function import TransferFunction
@@ -231,7 +230,7 @@ def test_a_drive_keeps_its_limits_and_comes_to_rest(low, width, rate, start, kin
         if done:
             break
     moves = np.abs(np.diff(path))
-    assert drive.v == limits.rest
+    assert drive.v == drive.rest
     assert moves.max() <= rate * 0.01 * (1.0 + 1e-9) + 1e-12
     assert min(path) >= limits.low
     assert max(path) <= limits.high
