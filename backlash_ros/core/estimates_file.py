@@ -12,7 +12,6 @@ from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 
-VERSION = 1  # of the file format
 # What a saved estimate depends on; a file for anything else is refused.
 KEY = (
     'estimator.law', 'sample_period', 'plant.numerator', 'plant.denominator',
@@ -35,7 +34,7 @@ def save_estimate(path: Path, estimate: Estimate, p: Parameters) -> None:
     """Write the file, complete or not at all; raises OSError."""
     values = {name: asdict(estimate)[name] for name in (*NEEDED, *DEVIATIONS)}
     content = {
-        'version': VERSION, 'key': _key(p),
+        'version': 1, 'key': _key(p),
         # JSON has no nan.
         'estimate': {name: None if isnan(value) else value for name, value in values.items()},
     }
@@ -71,8 +70,8 @@ def load_estimate(p: Parameters) -> Estimate | None:
     except (KeyError, TypeError, ValueError):
         raise refused('holds no saved estimates', 'delete it or name another one') from None
     estimate = Estimate(m, c_r, c_l, f, std_m, std_c_r, std_c_l)
-    if version != VERSION:
-        raise refused(f'has format {version!r}, not {VERSION}')
+    if version != 1:
+        raise refused(f'has format {version!r}, not 1')
     if was_given(estimate):
         raise refused('holds constants that were given, not learned')
     for part, value in _key(p).items():

@@ -33,7 +33,6 @@ from backlash_ros.tools.runs.files import Run, result_directory, write_table
 from backlash_ros.tools.runs.read_run import find_bag
 from backlash_ros.topics import BACKLASH
 
-FIGURE, TABLE = 'replay.png', 'replays.csv'
 HEADER = ('run', 'changed', 'm', 'c_r', 'c_l', 'std_m', 'std_c_r', 'std_c_l', 'tracking from [s]',
           'innovation RMS')
 
@@ -95,7 +94,7 @@ def _replay(args: Sequence[str] | None) -> None:
             words = ' '.join(f'{name}={as_yaml(value)}' for name, value in change.items())
             run = source.replayed(source.parameters.replaced(change), f'{source.path.name} {words}')
             rows.append(((str(source.path), words), _numbers(run)))
-    path = result_directory(options.out) / TABLE
+    path = result_directory(options.out) / 'replays.csv'
     write_table(path, HEADER, [(*names, *values) for names, values in rows])
     print(cli.format_table(HEADER, [(*names, *map(cli.number, values)) for names, values in rows]))
     print(path)
@@ -140,13 +139,13 @@ def _one(source: Source, out: Path | None) -> None:
     replayed = source.replayed(source.parameters, source.path.name)
     directory = result_directory(out)
     summary = write_report(Run(replayed, source.parameters), directory)
-    write_atomically(directory / FIGURE, figures.png(draw_replay(recorded, replayed)))
+    write_atomically(directory / 'replay.png', figures.png(draw_replay(recorded, replayed)))
     print(cli.format_table(('', 'run', 'replay', '±'), [
         (name, cli.number(recorded.column(name)[-1], 6), cli.number(summary['final'][name], 6),
          cli.number(summary['final_std'][name], 2)) for name in BACKLASH
     ]))
     print(_states(replayed) if isnan(recorded.column('m')[-1]) else _parted(recorded, replayed))
-    print(directory / FIGURE)
+    print(directory / 'replay.png')
     print(directory / REPORT_PAGE)
 
 

@@ -13,8 +13,6 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 NEARLY_ALL = 0.9  # share of what speaks for an explanation
-# Whole turns: degrees, radians, gradians, steps of encoders.
-WHOLE_TURNS = (360.0, 2.0 * np.pi, 400.0, 6400.0, 3600.0, *(2.0**n for n in range(8, 33)))
 
 
 def quantum(y: Array) -> float:
@@ -98,12 +96,14 @@ def unwrapped(values: Array) -> tuple[Array, float]:
     a few usual steps, with the motion around it the other way.
     """
     turn_tolerance = 0.02  # relative, of the jump of an angle that begins anew
+    # Degrees, radians, gradians, steps of encoders.
+    turns = (360.0, 2.0 * np.pi, 400.0, 6400.0, 3600.0, *(2.0**n for n in range(8, 33)))
     known = np.flatnonzero(np.isfinite(values))
     if len(known) < 10:
         return values, 0.0
     steps, reach = np.diff(values[known]), float(np.ptp(values[known]))
     usual = float(np.percentile(np.abs(steps), 95.0))
-    for turn in WHOLE_TURNS:
+    for turn in turns:
         jumps = np.abs(steps) > 0.6 * turn  # no motion from row to row
         fills = 0.9 * turn <= reach <= (1.0 + turn_tolerance) * turn
         if not fills or not jumps.any() or usual > 0.1 * turn:

@@ -94,11 +94,6 @@ def readings(
     return v, np.where(own, y, np.nan)
 
 
-def record_of_samples(t: Array, v: Array, y: Array, period: float) -> Record:
-    """A record from samples (N,) of a run of this package, which have their true time t [s]."""
-    return usable(on_grid(Rows(t - t[0], v, y), period), y)
-
-
 def usable(
     record: Record, read: Array, said: Sequence[str] = (), notes: Sequence[str] = (),
 ) -> Record:

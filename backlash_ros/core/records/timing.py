@@ -73,7 +73,8 @@ def on_grid(rows: Rows, period: float | None = None, late: bool = False) -> Reco
     are too few, or they are spread over too long a time.
     """
     nearly_even = 0.02  # of a period that stamps of even samples may be off
-    guess = period or (typical_step(rows.t) if late else _period(rows.t))
+    typical = typical_step(rows.t)
+    guess = period or (typical if late else _period(rows.t))
     rows, cut = _longest_stretch(rows, guess)
     if not np.isfinite(rows.y).any():
         raise RecordError(f'{cut}but y holds no number there: cut out one motion with --from, --to')

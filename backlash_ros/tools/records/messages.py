@@ -16,7 +16,7 @@ from backlash_ros.core.loop.diagnosis import TROUBLE
 from backlash_ros.core.loop.report_origin import without_origin
 from backlash_ros.core.records.record import Record, RecordError
 from backlash_ros.core.records.rows_to_record import readings, usable
-from backlash_ros.core.records.stamps import in_order, typical_step
+from backlash_ros.core.records.stamps import in_order
 from backlash_ros.core.records.timing import Rows, on_grid
 from backlash_ros.tools.runs.bag import choose_namespace, read_topics
 
@@ -78,8 +78,6 @@ def from_messages(heard: Mapping[str, Messages], period: float | None, of_axis: 
     if v is None:
         raise RecordError(f'holds no {topics.CONTROL}{of_axis}: record it as well')
     rows = Rows(t, v, y, commands, reported).since(t[0])
-    if not typical_step(rows.t) > 0.0:
-        raise RecordError('its stamps do not tell the sample period: give --period S')
     record = on_grid(rows, period, late=True)
     step = record.sample_period
     if record.commands is not None:

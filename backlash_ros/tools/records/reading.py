@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from backlash_ros.core.records.record import Record, RecordError
-from backlash_ros.core.records.rows_to_record import record_of, record_of_samples
+from backlash_ros.core.records.rows_to_record import record_of
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 from backlash_ros.tools.cli import WHOLE_SPAN, InputError, Span
 from backlash_ros.tools.config import effective_parameters
@@ -58,7 +58,8 @@ def _read(path: Path, period: float | None, axis: str, columns: Mapping[str, str
     if not run.samples:
         raise RecordError('holds no sample')
     t, v, y = (run.column(name) for name in 'tvy')
-    return replace(record_of_samples(t, v, y, period or run.sample_period), notes=source.notes)
+    record = record_of(t, v, y, period or run.sample_period, 1.0)
+    return replace(record, notes=(*source.notes, *record.notes))
 
 
 def _from_table(table: Table, period: float | None, given: Mapping[str, str]) -> Record:
