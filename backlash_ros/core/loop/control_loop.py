@@ -24,7 +24,6 @@ from backlash_ros.core.loop.loop_statistics import LoopStatistics
 from backlash_ros.core.loop.phase import Event, Phase, after
 from backlash_ros.core.loop.sample_counter import NEXT_SAMPLE, Arrival, Output, SampleCounter
 from backlash_ros.core.parameters import NOISE, Parameters
-from backlash_ros.core.plant.transfer_function import TransferFunction
 
 
 class Driver(NamedTuple):
@@ -61,7 +60,7 @@ class ControlLoop:
     send: takes v to the driver. estimate: to begin with, None for what was known before. counter:
     goes on counting where another loop has ended. v: the command that acts; None, and then taken
     for 0, as long as nobody knows (knows_v). executor: where fits are made, None for here. phase:
-    see phase.py.
+    see phase.py. nominal: G(z) as the parameters have it.
     """
 
     def __init__(
@@ -70,6 +69,7 @@ class ControlLoop:
         executor: Executor | None = None,
     ) -> None:
         self.counter, self.heard, self.phase = counter, Newest(), Phase.BEGINS
+        self.nominal = build_model(p)
         # Within six deviations of its noise y stands still.
         counts = LoopStatistics(still_band=6.0 * p.estimator.output_noise_std)
         self.commands = CommandHistory(p.sample_period, report_use(p), counts)
@@ -93,11 +93,6 @@ class ControlLoop:
     def v(self) -> float:
         """The newest command that acts, whoever has sent it."""
         return self.core.motion.v
-
-    @property
-    def nominal(self) -> TransferFunction:
-        """G(z) as the parameters have it."""
-        return build_model(self._p)
 
     @property
     def statistics(self) -> LoopStatistics:
@@ -167,13 +162,13 @@ class ControlLoop:
 
     def skip(self, arrival: Arrival) -> None:
         """Leave a sample unanswered of which this loop has no output."""
-        if arrival.is_sample and not self.standing_down:
+        if arrival.is_sample and self.phase is not Phase.STANDS_DOWN:
             self._note_missing(arrival)
             self._note_missing(Arrival(True, missing=1), lost=False)
 
     def send(self, v: float) -> None:
         """Send a command and note when it left; nothing while another controller commands."""
-        if self.standing_down:
+        if self.phase is Phase.STANDS_DOWN:
             return
         if v != self.v:  # it is none of the core
             self.core.motion = Motion(v, v - self.v, v)
@@ -184,7 +179,7 @@ class ControlLoop:
     def _is_usable(self, output: Output, arrival: Arrival, y_m: float) -> bool:
         """Count a message of y; returns whether there is a command to be made of it."""
         statistics = self.statistics
-        if self.standing_down:
+        if self.phase is Phase.STANDS_DOWN:
             return False
         if not arrival.is_sample:
             statistics.extra += 1
@@ -217,7 +212,7 @@ class ControlLoop:
     def _may_answer(self, output: Output) -> bool:
         """Begin anew where too much is missing; returns whether a v to go on from is known."""
         p, gap = self._p, self._gap
-        if gap is not NEXT_SAMPLE or self.silent:
+        if gap is not NEXT_SAMPLE or self.phase is Phase.SILENT:
             too_long = gap.missing > LONGEST_GAP or (
                 not p.lockstep
                 and 0.0 < p.timeout.plant_output < gap.missing * p.sample_period
@@ -313,7 +308,7 @@ class ControlLoop:
 
     def hear_other(self, v: float) -> None:
         """Take in a command of the controller that is in charge."""
-        if self.standing_down and plausible(v):
+        if self.phase is Phase.STANDS_DOWN and plausible(v):
             self._go_on_from(v)
             self.commands.newest_ns = self._driver.now_ns()
 

@@ -39,8 +39,8 @@ class JointLoops:
             ) for joint in p.joint_names
         }
         self.loops = tuple(self.by_name.values())
-        # To look after fits costs more than to wait for them, and they take longer than this.
-        pause = max(round(0.02 / p.sample_period / len(self.loops)), 1)  # samples
+        # To look after fits at every sample would cost as much as the sample; they take longer.
+        pause = max(round(0.05 / p.sample_period / len(self.loops)), 1)  # samples
         self.turns = cycle([turn for loop in self.loops for turn in (loop, *[None] * (pause - 1))])
 
     def answer(

@@ -246,7 +246,8 @@ class DriverIo:
     def publish(self, commands: Mapping[str, float]) -> None:
         """Send v, by joint, to the driver; an array as soon as there is a v of every joint."""
         if self.topics.control_type is Float64:
-            self.publisher.publish(message_with(commands['']))
+            # What rclpy would do after it has found out that these are bytes.
+            self.publisher.handle.publish_raw(message_with(commands['']))
         elif self.topics.control_type is JointState:
             self.publisher.publish(self._joint_state(commands))
         else:
