@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from math import isfinite
 
 from tqdm import tqdm
@@ -12,7 +12,7 @@ from tqdm import tqdm
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.loop.diagnosis import LoopFigures, state_beside
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.parameter import as_yaml
+from backlash_ros.core.parameters.parameter import Value, as_yaml
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.options import OptionParser
 from backlash_ros.tools import batch, cli
@@ -92,41 +92,31 @@ def _many(parameters: Parameters, options: argparse.Namespace) -> None:
            for name in (*swept, 'seed')), *outcome.values()]
         for job, outcome in zip(jobs, outcomes, strict=True)
     ])
-    if swept:
-        # The jobs of one change stand together.
-        size = len(outcomes) // len(changes)
-        print(format_table(
-            [*swept, *(f'RMSE {name}' for name in BACKLASH), 'settled, median', 'within 1 %'],
-            [[*map(as_yaml, change.values()), *_sweep_row(outcomes[i * size:][:size])]
-             for i, change in enumerate(changes)],
-        ))
-    else:
-        print(_seeds_table(outcomes))
+    size = len(outcomes) // len(changes)  # the jobs of one change stand together
+    print(_table(changes, [outcomes[i * size:][:size] for i in range(len(changes))]))
     _print_shortfalls(jobs, outcomes)
     print(f'runs: {csv}')
 
 
-def _seeds_table(outcomes: Sequence[Outcome]) -> str:
-    """Statistics of each parameter over the seeds, as text; raises InputError if all broke off."""
-    of = statistics(outcomes)
-    low, high = of['m'].nees_interval
-    header = ['', 'bias', 'RMSE', 'settled, median', 'settled, last', 'within 1 %',
-              f'NEES ({low:.2f} to {high:.2f})']
-    rows = [[
-        name, f'{s.bias:+.3g}', f'{s.rmse:.3g}', _seconds(s.settling_median),
-        _seconds(s.settling_max), f'{100.0 * s.within:.4g} %', f'{s.nees:.2f}',
-    ] for name, s in of.items()]
-    shown = None if all(isfinite(s.nees) for s in of.values()) else -1
-    return format_table(header[:shown], [row[:shown] for row in rows])
+def _table(changes: Sequence[Mapping[str, Value]], groups: Sequence[Sequence[Outcome]]) -> str:
+    """Statistics of each parameter over the runs of each change; NEES: with its interval of 95 %.
 
-
-def _sweep_row(outcomes: Sequence[Outcome]) -> list[str]:
-    """RMSE of each parameter, settling time of the slowest, share within 1 %."""
-    if all(outcome['problem'] for outcome in outcomes):
-        return [*[NOTHING] * 3, 'broke off', NOTHING]
-    of = statistics(outcomes).values()
-    return [*(f'{s.rmse:.3g}' for s in of), _seconds(max(s.settling_median for s in of)),
-            f'{100.0 * min(s.within for s in of):.4g} %']
+    Raises InputError where all runs of the only change broke off.
+    """
+    rows = []
+    for change, outcomes in zip(changes, groups, strict=True):
+        swept = list(map(as_yaml, change.values()))
+        if len(changes) > 1 and all(outcome['problem'] for outcome in outcomes):
+            rows.append([*swept, 'broke off', *[NOTHING] * 6])
+            continue
+        rows += [[
+            *swept, name, f'{s.bias:+.3g}', f'{s.rmse:.3g}', _seconds(s.settling_median),
+            _seconds(s.settling_max), f'{100.0 * s.within:.4g} %',
+            f'{s.nees:.2f} ({s.nees_interval[0]:.2f}–{s.nees_interval[1]:.2f})'
+            if isfinite(s.nees) else NOTHING,
+        ] for name, s in statistics(outcomes).items()]
+    return format_table([*changes[0], '', 'bias', 'RMSE', 'settled, median', 'settled, last',
+                         'within 1 %', 'NEES'], rows)
 
 
 def _print_shortfalls(jobs: Sequence[Job], outcomes: Sequence[Outcome]) -> None:
