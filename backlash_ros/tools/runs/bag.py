@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
 from itertools import chain, pairwise
 from math import isnan
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,23 +26,22 @@ Array = NDArray[np.float64]
 Table = dict[str, Array]
 
 
-@dataclass
-class Content:
+class Content(NamedTuple):
     """Stamps [ns] and messages of the wanted topics by recorded name, in the order of stamps.
 
     names: of all topics of the bag. damage: what is wrong with it and the cure, '' for nothing.
     """
 
-    names: set[str] = field(default_factory=set)
-    messages: dict[str, list[tuple[int, Any]]] = field(default_factory=dict)
-    damage: str = ''
+    messages: dict[str, list[tuple[int, Any]]]
+    names: set[str]
+    damage: str
 
 
 def read_topics(path: Path, wanted: Callable[[Topic], bool]) -> Content:
     """Decode the wanted topics of a bag, or what is left of them; raises InputError."""
     types = get_typestore(Stores.ROS2_JAZZY)
-    content = Content()
-    garbled = 0
+    found: dict[str, list[tuple[int, Any]]] = {}
+    garbled, damage = 0, ''
     try:
         reader = BagReader(path)
     except BagError as error:
@@ -51,26 +49,24 @@ def read_topics(path: Path, wanted: Callable[[Topic], bool]) -> Content:
     for topic, stamp_ns, raw in reader.messages(wanted):
         try:
             message = types.deserialize_cdr(raw, topic.message_type)
+            found.setdefault(topic.name, []).append((stamp_ns, message))
         # Whatever damaged bytes make the library stumble over, the message is lost.
         except Exception:
             garbled += 1
-            continue
-        content.messages.setdefault(topic.name, []).append((stamp_ns, message))
-    content.names = {topic.name for topic in reader.topics}
-    for messages in content.messages.values():
+    for messages in found.values():
         messages.sort(key=lambda each: each[0])
-    if reader.damage and not content.names:
+    if reader.damage and not reader.topics:
         raise InputError(f'{path}: {reader.damage}, and nothing of it can be read')
     if reader.damage or garbled:
-        stamps = [stamp for messages in content.messages.values() for stamp, _ in messages] or [0]
+        stamps = [stamp for messages in found.values() for stamp, _ in messages]
+        lasted_s = 1e-9 * (max(stamps) - min(stamps)) if stamps else 0.0
         unread = f', {garbled} more cannot be decoded' if garbled else ''
-        content.damage = (
-            f'{path} {reader.damage or "is damaged"}: this is what is left, '
-            f'{sum(map(len, content.messages.values()))} messages of '
-            f'{(max(stamps) - min(stamps)) * 1e-9:.1f} s{unread}; once it is not being recorded '
-            f'any more, `{REPAIR_COMMAND} {path}` completes it'
+        damage = (
+            f'{path} {reader.damage or "is damaged"}: this is what is left, {len(stamps)} messages '
+            f'of {lasted_s:.1f} s{unread}; once it is not being recorded any more, '
+            f'`{REPAIR_COMMAND} {path}` completes it'
         )
-    return content
+    return Content(found, {topic.name for topic in reader.topics}, damage)
 
 
 def choose_namespace(names: Sequence[str], axis: str) -> tuple[str, str]:
