@@ -26,7 +26,7 @@ from backlash_ros.core.parameters.parameter import Value
 from backlash_ros.core.parameters.table import BY_NAME
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.metrics import SETTLING_TOLERANCE
-from backlash_ros.tools.cli import BrokenOffError, InputError, number_of_samples
+from backlash_ros.tools.cli import BrokenOffError, InputError, StopRequests, number_of_samples
 from backlash_ros.tools.runs.read_run import run_loop
 from backlash_ros.tools.runs.summary import summarise
 from backlash_ros.topics import BACKLASH
@@ -155,11 +155,15 @@ def _in_processes(jobs: Sequence[Job], workers: int) -> Generator[tuple[int, Out
         workers, multiprocessing.get_context('spawn'), initializer=_end_with_parent
     )
     try:
-        # A signal that would cut short the start of a worker takes effect afterwards. Workers
-        # inherit for good what is blocked: a Ctrl-C is for their parent alone.
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT, signal.SIGTERM])
-        numbers = {executor.submit(run_job, job): i for i, job in enumerate(jobs)}
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        # A signal that would cut short the start of a worker takes effect afterwards, whichever
+        # thread gets it.
+        with StopRequests() as held:
+            # Workers inherit for good what is blocked: a Ctrl-C is for their parent alone.
+            signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+            numbers = {executor.submit(run_job, job): i for i, job in enumerate(jobs)}
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
+        if held.count:
+            raise KeyboardInterrupt
         for future in as_completed(numbers):
             yield numbers[future], future.result()
     except BrokenProcessPool:
