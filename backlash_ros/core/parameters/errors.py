@@ -12,9 +12,3 @@ class ParameterError(ValueError):
         self.name = name
         message = f'{name} {rule}' if value is UNTOLD else f'{name}={value!r} {rule}'
         super().__init__(f'{message}: {cure}' if cure else message)
-
-    def under(self, group: str) -> ParameterError:
-        """The same about the parameter of that name in a group."""
-        error = ParameterError(f'{group}.{self.name}', UNTOLD, '')
-        error.args = (f'{group}.{self}',)
-        return error

@@ -126,4 +126,6 @@ def _of_joint(joint: str, shared: Mapping[str, object], own: Mapping[str, object
     try:
         return Parameters(values)
     except ParameterError as error:
-        raise (error.under(joint) if error.name in own else error) from None
+        if error.name in own:
+            error.name, error.args = f'{joint}.{error.name}', (f'{joint}.{error}',)
+        raise
