@@ -85,4 +85,4 @@ with TemporaryDirectory() as folder:
         by = re.findall('^(?:FAILED|ERROR) .{,140}', out, re.MULTILINE)
         caught += bool(by)
         print(change, by or f'- of {within} tests', flush=True)
-print(caught, 'of', options.count, 'caught')
+print(caught, 'of', options.count, 'caught by', len(took), 'tests')

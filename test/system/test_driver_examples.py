@@ -19,6 +19,7 @@ BLOCKS = re.findall(
 # Beside these the commands that follow them are run.
 FOREVER = ('motor_driver.py', 'bare_dds_driver.py', '/controller', '/reference')
 SHORT_S = {'check_driver': '2', 'bringup': '1'}  # the pages give a user more time
+NARROW = {'identify': ['--order', '1-2', '--delay', '0-1']}  # and search for more
 DEADLINE_S = 240.0
 
 
@@ -28,7 +29,7 @@ def commands_of_driver_page() -> list[list[str]]:
 
 
 def runnable(words: list[str]) -> list[str]:
-    """The command as it is run here: this interpreter, and less time."""
+    """The command as it is run here: by this interpreter, and in less time."""
     program, *arguments = words
     name = program.removeprefix('.venv/bin/')
     modules = dict(
@@ -36,6 +37,7 @@ def runnable(words: list[str]) -> list[str]:
     )
     if name in SHORT_S and '--duration' in arguments:
         arguments[arguments.index('--duration') + 1] = SHORT_S[name]
+    arguments += NARROW.get(name, [])
     arguments = [a.replace('.venv/bin/python', sys.executable) for a in arguments]
     if name == 'python':
         return [sys.executable, *arguments]

@@ -26,17 +26,8 @@ RATE_MAX = 150.0
 STEP = RATE_MAX * PERIOD_S * (1.0 + 1e-9)
 STANDING = 5.13  # v at which a driver is found
 
-UNKNOWN_YAML = """
-/**:
-  ros__parameters:
-    estimator:
-      initial: {mm: 1.0}
-"""
-UNREADABLE_YAML = """
-/**:
-  ros__parameters:
-    plant: {denominator: [1, -2.5]}
-"""
+UNKNOWN_YAML = '/**: {ros__parameters: {estimator: {initial: {mm: 1.0}}}}'
+UNREADABLE_YAML = '/**: {ros__parameters: {plant: {denominator: [1, -2.5]}}}'
 
 
 def test_bad_input_ends_a_node_with_one_line_and_exit_code_2(tmp_path: Path) -> None:

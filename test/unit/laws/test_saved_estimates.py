@@ -81,11 +81,10 @@ def test_constants_that_were_learned_serve_the_law_that_learns_none(
         assert load_estimate(p) is not None
 
 
-@pytest.mark.parametrize(
-    'content',
-    ['', '{', '[]', '3', '{"version": 1}', 'null', '{"version": 1, "key": {}, "estimate": 2}',
-     '{"version": 1, "key": {}, "estimate": {"m": "1"}}', '\x00', '"estimate"'],
-)
+@pytest.mark.parametrize('content', [
+    '', '{', '[]', '3', '{"version": 1}', 'null', '{"version": 1, "key": {}, "estimate": 2}',
+    '{"version": 1, "key": {}, "estimate": {"m": "1"}}', '\x00', '"estimate"',
+])
 def test_a_broken_file_is_refused_in_one_sentence(tmp_path: Path, content: str) -> None:
     file = tmp_path / 'estimates.json'
     file.write_text(content)
@@ -93,11 +92,10 @@ def test_a_broken_file_is_refused_in_one_sentence(tmp_path: Path, content: str) 
         load_estimate(parameters(file))
 
 
-@pytest.mark.parametrize(
-    ('part', 'value', 'reason'),
-    [('m', 1000.0, 'outside of estimator.bounds.m'), ('c_r', -1000.0, 'outside'),
-     ('c_r', -4.0, 'c_l=-3.5 above c_r=-4.0'), ('c_l', None, 'no finite c_l')],
-)
+@pytest.mark.parametrize(('part', 'value', 'reason'), [
+    ('m', 1000.0, 'outside of estimator.bounds.m'), ('c_r', -1000.0, 'outside'),
+    ('c_r', -4.0, 'c_l=-3.5 above c_r=-4.0'), ('c_l', None, 'no finite c_l'),
+])
 def test_values_that_cannot_be_are_refused(tmp_path, part, value, reason):
     file = tmp_path / 'estimates.json'
     save_estimate(file, LEARNED, parameters(file))

@@ -18,10 +18,9 @@ def claim(identity: str, since_ns: int) -> dict[str, Any]:
     return {ENDPOINT: identity, SINCE: str(since_ns)}
 
 
-@pytest.mark.parametrize(
-    ('identity', 'since_ns', 'was_first'),
-    [('x', 99, True), ('x', 101, False), ('a', 100, True), ('c', 100, False)],
-)
+@pytest.mark.parametrize(('identity', 'since_ns', 'was_first'), [
+    ('x', 99, True), ('x', 101, False), ('a', 100, True), ('c', 100, False),
+])
 def test_the_time_of_activation_decides_and_the_identity_where_it_is_equal(
     identity: str, since_ns: int, was_first: bool,
 ) -> None:

@@ -66,14 +66,10 @@ def test_wear_moves_the_backlash_with_time_and_the_jump_comes_at_its_time() -> N
     assert seen[10] == pytest.approx((1.4, 5.0, -5.0))
 
 
-@pytest.mark.parametrize(
-    'changes',
-    [
-        {'backlash__jump': [-2.0, 0.0, 0.0]}, {'backlash__jump': [0.0, -3.0, 3.0]},
-        {'backlash__rate': [-1.0, 0.0, 0.0]},
-    ],
-    ids=['jump to m < 0', 'jump to c_l = c_r', 'm falls below 0 after 1.3 s'],
-)
+@pytest.mark.parametrize('changes', [
+    {'backlash__jump': [-2.0, 0.0, 0.0]}, {'backlash__jump': [0.0, -3.0, 3.0]},
+    {'backlash__rate': [-1.0, 0.0, 0.0]},
+], ids=['jump to m < 0', 'jump to c_l = c_r', 'm falls below 0 after 1.3 s'])
 def test_wear_never_ends_in_an_invalid_backlash(changes: dict[str, list[float]]) -> None:
     """It is refused at the start, or when it gets there, but never simulated."""
     with pytest.raises(ParameterError) as refusal:
