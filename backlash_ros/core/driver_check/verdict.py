@@ -60,26 +60,24 @@ class Verdict:
     def __init__(self) -> None:
         self.lines: dict[str, Judgement] = {}
 
-    def fits(self, subject: str, found: str) -> None:
-        """Nothing is wrong."""
-        self.lines.setdefault(subject, Judgement(subject, FITS, found))
-
     def check(
         self, subject: str, wrong: object, found: str, cure: str, hides: Sequence[str] = (),
+        well: str = '',
     ) -> None:
-        """If something is wrong, say so. hides: subjects that cannot be judged then."""
-        if not wrong or subject in self.lines:
-            return
-        # Amid jitter it is uncertain which v led to which y: what fits does, what does not may.
-        blurred = self.is_wrong('jitter') and subject in ('reaction delay', 'G(z)', 'noise on y')
-        self.lines[subject] = _hidden(subject, 'jitter') if blurred else \
-            Judgement(subject, WRONG, found, cure)
-        for other in hides:
-            self.lines.setdefault(other, _hidden(other, subject))
+        """Say what is wrong, if anything is, and else what is well.
 
-    def is_wrong(self, subject: str) -> bool:
-        """Whether it was judged to be."""
-        return subject in self.lines and self.lines[subject].mark == WRONG
+        hides: subjects that cannot be judged then. well: '' while more is to be checked.
+        """
+        if wrong and subject not in self.lines:
+            # Amid jitter it is uncertain which v led to which y: what does not fit may do so.
+            blurred = subject in ('reaction delay', 'G(z)', 'noise on y') and \
+                'jitter' in self.lines and self.lines['jitter'].mark == WRONG
+            self.lines[subject] = _hidden(subject, 'jitter') if blurred else \
+                Judgement(subject, WRONG, found, cure)
+            for other in hides:
+                self.lines.setdefault(other, _hidden(other, subject))
+        elif well:
+            self.lines.setdefault(subject, Judgement(subject, FITS, well))
 
 
 def _hidden(subject: str, behind: str) -> Judgement:
@@ -103,8 +101,8 @@ def judge(graph: Graph, heard: Heard, p: Parameters) -> list[Judgement]:
 def _judge_graph(verdict: Verdict, graph: Graph, p: Parameters) -> None:
     verdict.check(
         'publisher', graph.publishers > 1, f'{graph.publishers} publishers on plant_output',
-        'stop all but one (`ros2 topic info -v plant_output` names them)', (*MESSAGES, *MOTION))
-    verdict.fits('publisher', 'one publisher on plant_output')
+        'stop all but one (`ros2 topic info -v plant_output` names them)', (*MESSAGES, *MOTION),
+        'one publisher on plant_output')
     verdict.check(
         'type', graph.types != (FLOAT64,), f'plant_output is {", ".join(graph.types)}',
         f'publish y as {FLOAT64}', (*MESSAGES, *MOTION))
@@ -112,12 +110,11 @@ def _judge_graph(verdict: Verdict, graph: Graph, p: Parameters) -> None:
     misfits = (*graph.misfits, *[
         'plant_output is best effort, the controller asks for reliable'] * deaf)
     verdict.check('QoS', misfits, '; '.join(misfits), 'use reliable, volatile, keep last (the '
-                  'default profile) on both topics')
-    verdict.fits('QoS', 'compatible')
+                  'default profile) on both topics', well='compatible')
     near = f', but somebody to {", ".join(graph.near_control)}' if graph.near_control else ''
     verdict.check('listener', not graph.listeners, f'nobody listens to control{near}',
-                  f'let the driver subscribe control as {FLOAT64}, or remap it', MOTION)
-    verdict.fits('listener', 'control is subscribed')
+                  f'let the driver subscribe control as {FLOAT64}, or remap it', MOTION,
+                  'control is subscribed')
 
 
 def _judge_messages(verdict: Verdict, heard: Heard, timing: Timing, p: Parameters) -> None:
@@ -131,17 +128,14 @@ def _judge_messages(verdict: Verdict, heard: Heard, timing: Timing, p: Parameter
     verdict.check(
         'rate', not timing.fits, f'{rate}; sample_period says {p.sample_period * 1e3:g} ms',
         'publish once per sample_period, or set sample_period to what the driver does and give '
-        'G(z) for it', MOTION)
-    verdict.fits('rate', rate)
+        'G(z) for it', MOTION, rate)
     jitter = f'{timing.lateness:.0%} of a period (98 % of the samples)'
     verdict.check('jitter', timing.lateness > MOST_LATE, jitter, 'publish from a timer with '
-                  'absolute deadlines; give the driver a real-time priority')
-    verdict.fits('jitter', jitter)
+                  'absolute deadlines; give the driver a real-time priority', well=jitter)
     total = count + timing.missing
     lost = f'{timing.missing} of {total} samples'
     verdict.check('lost samples', timing.missing > TROUBLE * total, lost, 'publish every sample, '
-                  'reliable, without skipping any; on a network, use a cable')
-    verdict.fits('lost samples', lost)
+                  'reliable, without skipping any; on a network, use a cable', well=lost)
     verdict.check(
         'repeated samples', timing.repeated, f'{timing.repeated} came twice',
         'publish each sample once: take out what doubles them, a second timer or a relay')
@@ -152,21 +146,21 @@ def _judge_messages(verdict: Verdict, heard: Heard, timing: Timing, p: Parameter
     _, slower_s = own_readings(timing.period_s * timing.numbers.astype(float), y)
     verdict.check(
         'repeated samples', slower_s, f'y changes every {slower_s * 1e3:.3g} ms only, and repeats '
-        'between', 'publish when the sensor has a new value; sample_period is that of the sensor')
-    verdict.fits('repeated samples', 'none')
+        'between', 'publish when the sensor has a new value; sample_period is that of the sensor',
+        well='none')
     age_s = 1e-9 * float(np.median([m.received_ns - m.stamp_ns for m in timing.outputs]))
     age = f'samples arrive {abs(age_s) * 1e3:.2g} ms {"before" if age_s < 0.0 else "after"} they ' \
           'left'
     verdict.check(
         'clock', abs(age_s) > SKEW * timing.period_s, age,
-        'synchronise the clocks of both machines (chrony, PTP), or look for a slow network', MOTION)
-    verdict.fits('clock', age)
+        'synchronise the clocks of both machines (chrony, PTP), or look for a slow network', MOTION,
+        age)
     counts = {topic: sum(not plausible(message.value) for message in messages)
               for topic, messages in heard.by_topic.items()}
     absurd = ', '.join(f'{count} on {topic}' for topic, count in counts.items() if count)
     verdict.check('values', absurd, f'nan, inf or absurd: {absurd}',
-                  'publish nothing where the sensor has no value; the controller steps over it')
-    verdict.fits('values', 'all finite')
+                  'publish nothing where the sensor has no value; the controller steps over it',
+                  well='all finite')
 
 
 def _judge_reports(verdict: Verdict, heard: Heard, timing: Timing, p: Parameters) -> int:
@@ -193,9 +187,9 @@ def _judge_reports(verdict: Verdict, heard: Heard, timing: Timing, p: Parameters
     verdict.check(
         'applied_control', use is ReportUse.NEVER and limited_by,
         f'differs from control by up to {limited_by:.3g}',
-        'set estimator.use_applied_control: true, or narrow control.min, max, rate_max')
-    verdict.fits('applied_control', 'is published' if control is None else 'differs from control, '
-                 'as it may' if limited_by else 'agrees with control')
+        'set estimator.use_applied_control: true, or narrow control.min, max, rate_max',
+        well='is published' if control is None else 'differs from control, as it may'
+        if limited_by else 'agrees with control')
     return lag
 
 
@@ -235,37 +229,35 @@ def _judge_motion(
             'G(z)', other, f'is off by far, and less so for a sample period of {other:.3g} s',
             f'G(z) looks made for a sample period of about {other:.3g} s: discretise it with '
             f'sample_period, {p.sample_period:g} s', MOTION)
-    verdict.check(
-        'G(z)', unlike, f'predicts {max(fit.predicted, 0.0):.0%} of the motion of y',
-        'enter the G(z) of this plant, discretised with sample_period; see that y is measured '
-        'behind the gap and that the driver holds v over the period', MOTION)
     predicted = f'predicts {fit.predicted:.1%} of the motion of y'
     if fit.model is not fit.nominal:  # the loop learns it too
         between = frequencies_of(y)
         predicted += ' once it is corrected: it is off by ' + ', '.join(
             f'{error:.1%} at {frequency / (2.0 * pi * p.sample_period):.2g} Hz'
             for frequency, error in zip(between, fit.error_of_model(between), strict=True))
-    verdict.fits('G(z)', predicted)
+    verdict.check(
+        'G(z)', unlike, f'predicts {max(fit.predicted, 0.0):.0%} of the motion of y',
+        'enter the G(z) of this plant, discretised with sample_period; see that y is measured '
+        'behind the gap and that the driver holds v over the period', MOTION, predicted)
     verdict.check(
         'reaction delay', another_delay,
         f'{delay} samples; control.delay_samples says {expected}',
-        f'apply v as soon as it comes, or set control.delay_samples: {delay}')
-    verdict.fits('reaction delay', f'{expected} samples, as control.delay_samples says')
+        f'apply v as soon as it comes, or set control.delay_samples: {delay}',
+        well=f'{expected} samples, as control.delay_samples says')
     m = fit.estimates['m'][0]
     verdict.check('sign and units', fit.sign < 0.0, f'y moves against v: m would be {m:.4g}',
                   'change the sign of y or v in the driver, or of plant.numerator')
     outside = _outside(fit, p)
     verdict.check('sign and units', outside, outside, 'see the units of v, y and G(z) and the zero '
-                  'of v, or widen estimator.bounds')
-    verdict.fits('sign and units', f'm is about {m:.4g}, within its bounds')
+                  'of v, or widen estimator.bounds', well=f'm is about {m:.4g}, within its bounds')
     noise = f'deviation {best.noise:.2g}; estimator.output_noise_std says {noise_std:.2g}'
     verdict.check(
         'noise on y', noisy, noise, f'set estimator.output_noise_std: {best.noise:.1e}' + (
-            ', or give a more exact G(z): the residual is coloured' if coloured else ''))
-    verdict.fits('noise on y', noise)
-    verdict.check('backlash', fit.doubts, f'{unseen}; {"; ".join(fit.doubts)}', PAST)
-    verdict.fits('backlash', ', '.join(
-        f'{name} = {value:.4g} ± {std:.1g}' for name, (value, std) in fit.estimates.items()))
+            ', or give a more exact G(z): the residual is coloured' if coloured else ''),
+        well=noise)
+    verdict.check(
+        'backlash', fit.doubts, f'{unseen}; {"; ".join(fit.doubts)}', PAST, well=', '.join(
+            f'{name} = {value:.4g} ± {std:.1g}' for name, (value, std) in fit.estimates.items()))
 
 
 def _fitted(
