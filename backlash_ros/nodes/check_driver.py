@@ -62,7 +62,7 @@ def parse_options(plain: Sequence[str]) -> argparse.Namespace:
     parser.add_argument('--config', metavar='FILE', help='ROS 2 parameter file of the controller, '
                         'or the name of a shipped one')
     parser.add_argument('--drive', action='store_true', help='move v, to and fro within '
-                        'control.min, control.max and control.rate_max, to rest at the end')
+                        'the limits of control, to rest at the end')
     parser.add_argument('--save', type=Path, metavar='FILE', help='write t,v,y as CSV')
     add_motion_options(parser, 10.0, 'how long to listen')
     options = parser.parse_args(plain)

@@ -6,15 +6,16 @@ import numpy as np
 from scipy.signal import cont2discrete
 
 from backlash_ros.core.assembly import build_plant
+from backlash_ros.core.control.limits import Limits
 from backlash_ros.core.driver_check.heard import Graph, Heard, Message
 from backlash_ros.core.driver_check.verdict import FLOAT64, WRONG, Judgement, judge
-from backlash_ros.core.identification.motion import Drive, Range, waves
+from backlash_ros.core.identification.motion import Drive, waves
 from backlash_ros.core.parameters import Parameters
 
 PERIOD_S = 0.04  # long enough that a busy machine does not disturb it
 NATURAL = 2.0 * pi * 2.0  # rad/s
 START_NS = 1_800_000_000_000_000_000
-LIMITS = Range(-5.0, 5.0, 30.0)
+REACH, RATE = 5.0, 30.0  # of v
 GOOD_GRAPH = Graph(publishers=1, types=(FLOAT64,), listeners=1)
 
 
@@ -31,7 +32,7 @@ def parameters(**changes: object) -> dict[str, object]:
     return {
         'sample_period': PERIOD_S, 'plant.numerator': numerator,
         'plant.denominator': denominator, 'estimator.output_noise_std': 1e-3,
-        'control.min': LIMITS.low, 'control.max': LIMITS.high, 'control.rate_max': LIMITS.rate,
+        'control.min': -REACH, 'control.max': REACH, 'control.rate_max': RATE,
         **{name.replace('__', '.'): value for name, value in changes.items()},
     }
 
@@ -58,11 +59,11 @@ def heard_from_driver(
 ) -> Heard:
     """What is heard of a driver while v moves.
 
-    delay: samples by which it applies v later. reach: share of LIMITS that v uses. report: whether
+    delay: samples by which it applies v later. reach: share of REACH that v uses. report: whether
     it publishes applied_control. limit: of v inside the driver. rising: v only rises, from
     0, so that the left side is never engaged.
     """
-    limits = Range(reach * LIMITS.low, reach * LIMITS.high, LIMITS.rate)
+    limits = Limits(-reach * REACH, reach * REACH, RATE * PERIOD_S)
     drive = Drive(waves, limits, PERIOD_S, samples * PERIOD_S)
     plant = build_plant(plant_parameters())
     v: list[float] = []
@@ -70,7 +71,7 @@ def heard_from_driver(
     applied: list[float] = []
     for k in range(samples):
         y.append(sign * plant.measure())
-        v.append(reach * LIMITS.high * k / samples if rising else drive.step())
+        v.append(reach * REACH * k / samples if rising else drive.step())
         late = v[k - delay] if k >= delay else 0.0
         applied.append(min(max(late, -limit), limit))
         plant.step(applied[-1])

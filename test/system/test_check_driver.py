@@ -9,7 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from drivers.made_up_driver import LIMITS, PERIOD_S, parameters
+from drivers.made_up_driver import PERIOD_S, RATE, REACH, parameters
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_processes import NodeProcess, RosWorld, ros_world
 from std_msgs.msg import Float64
@@ -85,7 +85,7 @@ def test_a_drive_goes_on_from_the_v_that_acts_and_ends_at_rest_or_at_once(world:
     assert 'Traceback' not in first.stderr
     assert first.stderr.count('nobody says which v acts now') == 1
     assert 'rate' in first.stdout
-    assert_within_rate(0.0, controls, LIMITS.rate)
+    assert_within_rate(0.0, controls, RATE)
     begin = len(controls)
     again = start(world, '--drive', '--rate', '0.5', '--ros-args', '-p', 'control.initial:=-4.0')
     probe.wait_until(lambda: len(controls) > begin + 5, 'a motion')
@@ -116,7 +116,7 @@ def test_a_good_driver_passes_and_what_cannot_be_driven_is_refused_or_ended(worl
         rows = list(csv.DictReader(file))
     # However late they were on a busy machine.
     assert len(rows) >= 6.0 / PERIOD_S
-    assert max(abs(float(row['v'])) for row in rows) <= LIMITS.high
+    assert max(abs(float(row['v'])) for row in rows) <= REACH
     code, told = check(world, '--drive', '--output-range', '-0.5', '0.5', '--duration', '30')
     assert code == 1
     assert 'left --output-range' in told

@@ -9,30 +9,21 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from itertools import count
 from math import inf, pi, sin
-from typing import NamedTuple
 
+from backlash_ros.core.control.limits import Limits, at_rest, last_commands
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 
-
-class Range(NamedTuple):
-    """Limits of v [unit of v] and of its speed [unit of v / s]."""
-
-    low: float
-    high: float
-    rate: float
+# Lowest and highest v, its speed [v/s], sample period [s], duration [s] and first v to its v(k).
+Shape = Callable[[float, float, float, float, float, float], Iterator[float]]
 
 
-# Low, high, rate of a Range, sample period [s], duration [s] and first v of a motion to its v(k).
-Motion = Callable[[float, float, float, float, float, float], Iterator[float]]
-
-
-def drive_range(p: Parameters, amplitude: float | None, rate: float | None) -> Range:
+def drive_limits(p: Parameters, amplitude: float | None, rate: float | None) -> Limits:
     """What both the parameters and the options allow.
 
     Raises ParameterError where a limit is missing or the limits exclude each other.
     """
-    excursion = inf if amplitude is None else amplitude
+    excursion, period = inf if amplitude is None else amplitude, p.sample_period
     low, high = max(p.control.min, -excursion), min(p.control.max, excursion)
     speed = min(p.control.rate_max, inf if rate is None else rate)
     for name, value, option in (
@@ -43,33 +34,29 @@ def drive_range(p: Parameters, amplitude: float | None, rate: float | None) -> R
             raise ParameterError(
                 name, value, 'is no limit to drive within', f'set {name}, or give {option}')
     if not low < high:
-        raise ParameterError(
-            'control.min', low, f'must be < control.max={high!r} within --amplitude={excursion:g}'
-        )
-    return Range(low, high, speed)
+        raise ParameterError('control.min', low, f'must be < control.max={high!r} within '
+                             f'--amplitude={excursion:g}')
+    return Limits(low, high, speed * period, p.control.acceleration_max * period**2)
 
 
 class Drive:
-    """v(k) along a motion within limits. rest: where v ends, 0 or the limit next to it."""
+    """v(k) along a motion of some shape, from v on, within limits."""
 
     def __init__(
-        self, motion: Motion, limits: Range, sample_period: float, duration: float, v: float = 0.0,
+        self, shape: Shape, limits: Limits, sample_period: float, duration: float, v: float = 0.0,
     ) -> None:
-        self.rest, self.v = min(max(0.0, limits.low), limits.high), v
-        self._move = limits.rate * sample_period
-        self._motion = motion(*limits, sample_period, duration, v)
+        self._limits, self._motion = limits, at_rest(v)
+        self._shape = shape(limits.low, limits.high, limits.move / sample_period, sample_period,
+                            duration, v)
 
     def step(self) -> float:
         """The next v."""
-        return self._towards(next(self._motion))
+        self._motion = self._limits.apply(next(self._shape), self._motion)
+        return self._motion.v
 
-    def step_to_rest(self) -> bool:
-        """Move v towards rest; return whether it has got there."""
-        return self._towards(self.rest) == self.rest
-
-    def _towards(self, target: float) -> float:
-        self.v = min(max(target, self.v - self._move), self.v + self._move)
-        return self.v
+    def to_rest(self) -> Iterator[float]:
+        """v from here to 0, or to the limit next to it, where it stays."""
+        return last_commands('ramp', self._motion, lambda: self._limits)
 
 
 def waves(

@@ -17,7 +17,7 @@ from backlash_ros import topics
 from backlash_ros.core.assembly import build_controller, build_limits
 from backlash_ros.core.control.limits import plausible
 from backlash_ros.core.driver_check.heard import Heard, Message
-from backlash_ros.core.identification.motion import Drive, Motion, drive_range
+from backlash_ros.core.identification.motion import Drive, Shape, drive_limits
 from backlash_ros.core.parameters.table import CONTROLLER
 from backlash_ros.nodes.control.rivals import Presence, identity_made_by
 from backlash_ros.nodes.drive.driver_graph import DriverGraph
@@ -39,14 +39,14 @@ class MotionNode(ProcessNode):
     ended before its time, empty if it did not. names: full names of the topics.
     """
 
-    def __init__(self, program: str, options: argparse.Namespace, motion: Motion) -> None:
+    def __init__(self, program: str, options: argparse.Namespace, shape: Shape) -> None:
         super().__init__(program, parameters_of=CONTROLLER)
         p = self.settings
         build_controller(p)
         self.options = options
         if options.drive:
-            limits = drive_range(p, options.amplitude, options.rate)
-            self._begin = partial(Drive, motion, limits, p.sample_period, options.duration)
+            limits = drive_limits(p, options.amplitude, options.rate)
+            self._begin = partial(Drive, shape, limits, p.sample_period, options.duration)
         self.heard = Heard()
         self.motion: Drive | None = None
         self.ended, self.exit_code = '', FAILED
@@ -172,22 +172,22 @@ class MotionNode(ProcessNode):
         return known or 0.0
 
     def _come_to_rest(self) -> None:
-        motion, before = self.motion, len(self.signals)
-        if motion is None:
+        if self.motion is None:
             return
-        deadline = time.monotonic() + self.options.rest
-        while not motion.step_to_rest():
-            self._control.publish(Float64(data=motion.v))
+        before, deadline = len(self.signals), time.monotonic() + self.options.rest
+        v = self.heard.controls[-1].value
+        for v in self.motion.to_rest():
+            self._control.publish(Float64(data=v))
             time.sleep(self.settings.sample_period)
             late = time.monotonic() > deadline
             if late or len(self.signals) > before:
                 why = f'not at rest within --rest={self.options.rest:g} s' if late \
                     else 'another signal came'
-                self.say(f'v is held at {motion.v:.6g}: {why}')
+                self.say(f'v is held at {v:.6g}: {why}')
                 break
         # A busy machine may lose a message, and this one is to be heard before the node leaves.
         for _ in range(10):
-            self._control.publish(Float64(data=motion.v))
+            self._control.publish(Float64(data=v))
             if self._control.wait_for_all_acked(Duration(seconds=0.1)):
                 return
-        self.say(f'the driver has not confirmed the last v={motion.v:.6g}')
+        self.say(f'the driver has not confirmed the last v={v:.6g}')

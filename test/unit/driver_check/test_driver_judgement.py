@@ -3,14 +3,16 @@
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import islice
 from math import nan
 
 import numpy as np
 import pytest
 from drivers.made_up_driver import (
     GOOD_GRAPH,
-    LIMITS,
     PERIOD_S,
+    RATE,
+    REACH,
     faults,
     heard_from_driver,
     model,
@@ -20,9 +22,10 @@ from drivers.made_up_driver import (
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from backlash_ros.core.control.limits import Limits
 from backlash_ros.core.driver_check.heard import Heard, Message
 from backlash_ros.core.driver_check.verdict import FLOAT64, UNKNOWN, all_fit, judge, table
-from backlash_ros.core.identification.motion import Drive, Range, drive_range, strokes, waves
+from backlash_ros.core.identification.motion import Drive, drive_limits, strokes, waves
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.transfer_function import TransferFunction
@@ -215,25 +218,22 @@ def test_a_model_that_is_off_by_a_fifth_fits_and_the_finding_says_how_far(ratio:
 
 @given(
     st.floats(-20.0, 5.0), st.floats(0.1, 30.0), st.floats(0.1, 200.0), st.floats(-3.0, 3.0),
-    st.sampled_from([waves, strokes]),
+    st.floats(0.01, 1.0) | st.just(np.inf), st.sampled_from([waves, strokes]),
 )
-@example(-15.983699780621828, 29.100769855162365, 103.26211025102096, -2.3048063251753783,
+@example(-15.983699780621828, 29.100769855162365, 103.26211025102096, -2.3048063251753783, np.inf,
          strokes)
-def test_a_drive_keeps_its_limits_and_comes_to_rest(low, width, rate, start, kind) -> None:
-    limits = Range(low, low + width, rate)
+def test_a_drive_keeps_its_limits_and_comes_to_rest(low, width, rate, start, acceleration, kind):
+    limits = Limits(low, low + width, 0.01 * rate, acceleration)
     start = min(max(start, limits.low), limits.high)
     drive = Drive(kind, limits, 0.01, 2.0, start)
-    path = [start] + [drive.step() for _ in range(200)]
-    for _ in range(100_000):
-        done = drive.step_to_rest()
-        path.append(drive.v)
-        if done:
-            break
+    path = [start, *(drive.step() for _ in range(200))]
+    path += islice(drive.to_rest(), 100_000)
     moves = np.abs(np.diff(path))
-    assert drive.v == drive.rest
-    assert moves.max() <= rate * 0.01 * (1.0 + 1e-9) + 1e-12
-    assert min(path) >= limits.low
-    assert max(path) <= limits.high
+    assert path[-1] == limits.zero
+    assert moves.max() <= limits.move * (1.0 + 1e-9) + 1e-12
+    assert np.abs(np.diff(moves)).max() <= acceleration * (1.0 + 1e-9) + 1e-12
+    assert min(path) >= limits.low - 1e-12
+    assert max(path) <= limits.high + 1e-12
 
 
 @pytest.mark.parametrize(('limits', 'name'), [
@@ -242,13 +242,13 @@ def test_a_drive_keeps_its_limits_and_comes_to_rest(low, width, rate, start, kin
 ])
 def test_drive_without_a_limit_is_refused(limits: dict[str, float], name: str) -> None:
     with pytest.raises(ParameterError, match=name):
-        drive_range(Parameters(limits), None, None)
+        drive_limits(Parameters(limits), None, None)
 
 
 def test_options_narrow_the_limits_and_never_widen_them() -> None:
     p = Parameters(parameters())
-    assert drive_range(p, 2.0, 10.0) == Range(-2.0, 2.0, 10.0)
-    assert drive_range(p, 100.0, 1000.0) == LIMITS
+    assert drive_limits(p, 2.0, 10.0) == Limits(-2.0, 2.0, 10.0 * PERIOD_S)
+    assert drive_limits(p, 100.0, 1000.0) == Limits(-REACH, REACH, RATE * PERIOD_S)
 
 
 def test_similar_topics_are_named_first() -> None:
