@@ -3,17 +3,19 @@
     C = H^-1 (J' R J) H^-1,   H = J'J + what is known beside the samples
 
 with normalised rows J and the Toeplitz matrix R of the residual's autocovariance, tapered to zero
-at sqrt(N) lags. Of white residuals that is H^-1; the error of a quantised y is not white. No
-variance is less than that of white noise. Other than the inflation of a WindowFit it believes
-that what is left over is noise, and averages out in the end.
+beyond those lags over which it lasts. Of white residuals that is H^-1; the error of a quantised y
+is not white. No variance is less than that of white noise. Other than the inflation of a WindowFit
+it believes that what is left over is noise, and averages out in the end.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from math import sqrt
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
-from scipy.special import gammaincc
 
 from backlash_ros.core.estimation.fit import Problem
 from backlash_ros.core.estimation.posterior import WindowFit
@@ -38,15 +40,6 @@ def _convolved(a: Array, b: Array) -> Array:
     return np.asarray(irfft(rfft(a, size, axis=0) * rfft(b, size, axis=0), size, axis=0))[:count]
 
 
-def ljung_box(residual: Array) -> float:
-    """Probability that a white residual looks as correlated as this one."""
-    count = int(np.isfinite(residual).sum())
-    lags = min(20, count // 5)
-    r = autocorrelation(residual, lags)[1:]
-    q = count * (count + 2.0) * float(np.sum(r**2 / (count - np.arange(1, lags + 1))))
-    return float(gammaincc(0.5 * lags, 0.5 * q))  # the chi-squared distribution's upper tail
-
-
 def covariance_of(problem: Problem, f: WindowFit) -> Array:
     """Covariance of theta, shape (3 + K, 3 + K)."""
     columns, count = problem.rows(f)[:, :-1], len(problem.v)
@@ -58,7 +51,10 @@ def covariance_of(problem: Problem, f: WindowFit) -> Array:
     inverse = np.linalg.pinv(upper, rcond=1e-12)
     rows = int(problem.known.sum())
     variance = float(np.nansum(residual**2)) / max(rows - columns.shape[1], 1)
-    lags = max(round(np.sqrt(rows)), 1)
+    # As many as the correlation lasts (D. W. K. Andrews, Econometrica 59 (1991) 817-858).
+    r = lag_one(residual[problem.known])
+    lasts = 1.1447 * (4.0 * r**2 / (1.0 - r**2) ** 2 * rows) ** (1.0 / 3.0)
+    lags = max(round(max(sqrt(rows), min(lasts, 0.25 * rows))), 1)
     r = autocorrelation(residual, lags) * (1.0 - np.arange(lags + 1) / (lags + 1.0))
     q[~np.append(problem.known, np.zeros(len(q) - count, dtype=bool))] = 0.0
     middle = q[:count].T @ _convolved(
@@ -68,3 +64,26 @@ def covariance_of(problem: Problem, f: WindowFit) -> Array:
     matrix = root @ root.T
     at = len(matrix) - len(f.theta)
     return np.asarray(matrix[at:, at:])
+
+
+def by_model(gap: float, others: Iterable[tuple[float, float]]) -> float:
+    """Deviation of a gap that other models tell: as of a profile likelihood, by the steepest one.
+
+    others: gap of each, and twice the log-likelihood by which it falls behind.
+    """
+    return max((abs(other - gap) / sqrt(max(behind, 1.0))
+                for other, behind in others if behind <= 4.0), default=0.0)
+
+
+def effective(residual: Array) -> float:
+    """How many independent ones residuals (R,) count as: N (1 - r) / (1 + r)."""
+    r = lag_one(residual)
+    return len(residual) * (1.0 - r) / (1.0 + r)
+
+
+def lag_one(residual: Array) -> float:
+    """Correlation of the residuals (R,) of successive rows, at least 0."""
+    energy = float(np.mean(residual**2)) if len(residual) > 1 else 0.0
+    if energy == 0.0 or not np.isfinite(energy):
+        return 0.0
+    return min(max(float(np.mean(residual[1:] * residual[:-1])) / energy, 0.0), 0.99)

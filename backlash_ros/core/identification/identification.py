@@ -1,58 +1,62 @@
 """From v and y to backlash, G(z), delay and noise, with deviations and all that keeps them apart.
 
     the best structure (structure_search.py)  ->  a fit of the whole record
-    ->  deviations, verdict (description.py)
+    ->  deviations (deviations.py), verdict (verdict.py), all in units of the record
 
 Search and fit are those of the loop, for plants without a prior (structure.py).
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator
 from dataclasses import replace
-from math import log
+from math import inf, log, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.fit import FIRST_STEPS
-from backlash_ros.core.identification.description import as_a_gain, described
-from backlash_ros.core.identification.order_selection import PLATEAU, effective, equal_delays
-from backlash_ros.core.identification.response import least_response
-from backlash_ros.core.identification.result import Identification, Options
-from backlash_ros.core.identification.structure import TINY, Structure, fitted, moved_to
+from backlash_ros.core.identification.deviations import covariance_of, effective, lag_one
+from backlash_ros.core.identification.order_selection import PLATEAU, cancelled_poles, equal_delays
+from backlash_ros.core.identification.response import least_response, response_of
+from backlash_ros.core.identification.result import Details, HeldOut, Identification, Options
+from backlash_ros.core.identification.structure import (
+    TINY,
+    VAGUE,
+    Model,
+    Samples,
+    Structure,
+    fitted,
+    moved_to,
+)
 from backlash_ros.core.identification.structure_search import (
     EARLY,
     POLES,
+    Progress,
+    StructureSearch,
     Units,
     begun,
     later,
+    observed_of,
     searched,
     without_outliers,
 )
-from backlash_ros.core.records.samples import busiest, check_record
+from backlash_ros.core.identification.verdict import CERTAIN, Findings, judge
+from backlash_ros.core.records.readings import quantum
+from backlash_ros.core.records.samples import busiest, check_record, frequencies_of
 
 Array = NDArray[np.float64]
 
-def identify(v: Array, y: Array, sample_period: float, options: Options | None = None,
-             ) -> Identification:
+
+def identify(
+    v: Array, y: Array, sample_period: float, options: Options | None = None,
+    progress: Progress = lambda _: None,
+) -> Identification:
     """Identify v (N,), applied from k to k+1, and y (N,) at k, nan where lost.
 
-    Raises ValueError for arrays that do not fit together or hold what is no number.
+    progress: is told what is being done. Raises ValueError for arrays that do not fit together or
+    hold what is no number.
     """
-    work = identifying(v, y, sample_period, options or Options())
-    while True:
-        try:
-            next(work)
-        except StopIteration as done:
-            found: Identification = done.value
-            return found
-
-
-def identifying(
-    v: Array, y: Array, sample_period: float, options: Options,
-) -> Generator[str, None, Identification]:
-    """The same; yields what is being done."""
+    options = options or Options()
     v, y = np.asarray(v, dtype=float), np.asarray(y, dtype=float)
     check_record(v, y)
     given, part = Identification(sample_period, v, y), busiest(v, y)
@@ -60,26 +64,24 @@ def identifying(
     if nothing:
         return replace(given, reasons=(nothing,))
     units = Units(float(v.mean()), float(np.ptp(v[part])), float(np.nanmedian(y)),
-                   float(np.nanstd(y[part])))
+                  float(np.nanstd(y[part])))
     v, y = (v - units.v) / units.v_size, (y - units.y) / units.y_size
-    s = yield from searched(v[part], y[part], options, options.delays or EARLY)
+    s = searched(v[part], y[part], options, options.delays or EARLY, progress)
     if not options.delays:
-        s = yield from later(s, options)
-    yield 'choosing the delay'
+        s = later(s, options, progress)
+    progress('choosing the delay')
     best, rows = s.best, effective(s.best.left)
     others = [
-        fitted(s.samples, structure, moved_to(structure, best))
-        for delay in equal_delays(s.compared, s.chosen) if delay != best.structure.delay
-        for structure in [replace(best.structure, delay=delay)]
+        fitted(s.samples, structure, moved_to(structure, best)) for structure in (
+            replace(best.structure, delay=delay) for delay in equal_delays(s.compared, s.chosen))
     ]
     # With as many poles, some of them may fit worse.
     best, beside = least_response(s.samples, best, [
-        one for one in others if rows * log(max(one.squares, TINY) / max(best.squares, TINY))
-        <= PLATEAU
-    ], best.squares / rows)
+        one for one in others if one.structure != best.structure and rows * log(
+            max(one.squares, TINY) / max(best.squares, TINY)) <= PLATEAU], best.squares / rows)
     samples = s.samples
     if len(v) > len(samples.v):
-        yield 'fitting the whole record'
+        progress('fitting the whole record')
         whole = y.copy()
         whole[part] = samples.y
         samples = replace(samples, v=v, y=whole, last=len(v))
@@ -89,12 +91,11 @@ def identifying(
         if kept is not samples:
             samples = kept
             best = fitted(samples, best.structure, best.fit, beside=beside)
-    yield 'judging'
+    progress('judging')
     given = replace(given, outliers=int((np.isfinite(given.y) & np.isnan(samples.y)).sum()))
     s = s._replace(samples=samples, best=best, held_out=s.held_out._replace(
         first=part.start + s.held_out.first))
-    found = described(s, given, options, units)
-    return as_a_gain(found, s, given, options, units)
+    return _as_a_gain(_described(s, given, options, units), s, given, options, units)
 
 
 def _why_nothing(v: Array, y: Array, options: Options) -> str:
@@ -115,3 +116,132 @@ def _why_nothing(v: Array, y: Array, options: Options) -> str:
     if np.nanmax(y) == np.nanmin(y):
         return 'y stood still: let v swing wider than the gap, and see that y is measured'
     return ''
+
+
+def _delay_open(samples: Samples, best: Model) -> bool:
+    """Whether one more sample of delay fits as well."""
+    samples = replace(samples, first=samples.first + 1)
+    longer = replace(best.structure, delay=best.structure.delay + 1)
+    this, other = (fitted(samples, structure, moved_to(structure, best))
+                   for structure in (best.structure, longer))
+    ratio = log(max(other.squares, TINY) / max(this.squares, TINY))
+    return bool(best.structure.delay) and effective(this.left) * ratio < PLATEAU
+
+
+def _crossings(best: Model, covariance: Array, units: Units) -> tuple[float, Array]:
+    """c_r, and the covariance of (gap, c_r), shape (2, 2)."""
+    taps = best.structure.numerator_taps
+    b, a = float(best.numerator.sum()), 1.0 + float(best.a.sum())
+    # Unless G integrates, the middle of y is part of the offset.
+    shift = 0.0 if best.structure.integrator or not b else units.y / units.y_size * a / b
+    c_r = units.v + units.v_size * (float(best.fit.theta[1]) - shift)
+    jacobian = np.zeros((2, len(covariance)))
+    jacobian[0, 2] = jacobian[1, 1] = units.v_size
+    jacobian[1, 3:3 + taps] = VAGUE * units.v_size * shift / b if b else 0.0
+    jacobian[1, 3 + taps:] = -VAGUE * units.v_size * shift / a if a else 0.0
+    return c_r, np.asarray(jacobian @ covariance @ jacobian.T)
+
+
+def _described(
+    s: StructureSearch, given: Identification, options: Options, units: Units,
+) -> Identification:
+    """Everything there is to say of the best fit."""
+    best, chosen, structure = s.best, s.chosen, s.best.structure
+    covariance = covariance_of(best.problem, best.fit)
+    c_r, crossings = _crossings(best, covariance, units)
+    gap, apart = units.v_size * best.gap, units.v_size * s.apart
+    gap_var, c_r_var = np.diag(crossings).tolist()
+    c_l_var = max(gap_var + c_r_var - 2.0 * float(crossings[0, 1]), 0.0)
+    g = response_of(best, covariance, units.y_size / units.v_size)
+    low, high = frequencies_of(best.simulated)
+    low = max(low, np.pi / len(best.simulated))
+    frequencies = np.geomspace(low, max(high, 1.01 * low), 60, dtype=np.float64)
+    spread, gain_std = g.std(frequencies), float(g.std(np.zeros(1))[0])
+    middle = np.sqrt(frequencies[:1] * frequencies[-1:])
+    residual, squares, still = best.left, best.squares, _still(best)
+    first, measured, simulated, rms, trained = s.held_out
+    held_out = HeldOut(first, units.y + units.y_size * measured,
+                       units.y + units.y_size * simulated, units.y_size * rms,
+                       units.y_size * trained)
+    delays = tuple(sorted({*equal_delays(s.compared, chosen), structure.delay}))
+    correlation = max(lag_one(residual) - 3.0 / sqrt(len(residual)), 0.0)
+    observed = observed_of(s.samples, best, units)
+    step, total = quantum(observed.y), float(g.numerator.sum())
+    verdict = judge(Findings(
+        observed, gap, sqrt(gap_var), apart, c_r, sqrt(max(c_r_var, 0.0)),
+        float(np.abs(g.at(middle))[0]),
+        total if structure.integrator else total / float(g.denominator.sum()),
+        gain_std, float(spread.max()),
+        # Whatever the correlation: what explains nine tenths of y shows v.
+        inf if squares < 0.1 * still
+        else 0.5 * effective(residual) * log(still / max(squares, TINY)),
+        correlation, held_out.rms, held_out.trained,
+        [(units.v_size * rival, behind) for rival, behind in s.rivals], best.reversals, step,
+        cancelled_poles(best), structure.delay,
+        # Where many fit alike, the gap does not depend on the delay.
+        structure.delay == max(s.delays) and len(delays) < 3 and _delay_open(s.samples, best),
+    ))
+    # What no model explains moves both sides of the gap alike.
+    more = 0.25 * (verdict.gap_std**2 - gap_var)
+    # As parameters have it: z where G is a gain, for B acts a sample late.
+    at_zero = structure.numerator_taps - structure.order
+    free = len(residual) - structure.unknowns
+    return replace(
+        given, m=options.slope, gap=gap, c_r=c_r, c_l=c_r - gap,
+        std={'m': options.slope * gain_std, 'gap': verdict.gap_std,
+             'c_r': sqrt(max(c_r_var + more, 0.0)), 'c_l': sqrt(c_l_var + more)},
+        numerator=tuple((g.numerator / options.slope).tolist()),
+        denominator=(*best.denominator.tolist(), *[0.0] * at_zero),
+        delay=structure.delay, delays=delays, integrator=structure.integrator,
+        noise_std=units.y_size * sqrt(squares / max(free, 1)), quantum=step,
+        correlation=correlation, frequencies=frequencies, response_std=spread,
+        uncertainty=_as_parameter(2.0 * float(spread.max())),
+        reasons=verdict.reasons, remarks=verdict.remarks, verdict=verdict,
+        details=Details(
+            s.samples.first, units.v + units.v_size * best.problem.v, observed.y, observed.p,
+            observed.simulated, g,
+            tuple(one._replace(held_out=units.y_size * one.held_out) for one in s.compared), chosen,
+            (units.v_size * s.profile[0], units.y_size * s.profile[1]), held_out),
+    )
+
+
+def _as_a_gain(
+    found: Identification, s: StructureSearch, given: Identification, options: Options,
+    units: Units,
+) -> Identification:
+    """With a G that is a gain and a delay, where a better one is not known but the gap is.
+
+    A slow log of a position servo tells no more; what moves y otherwise counts as an error of G.
+    """
+    gains = [one for one in s.compared if one.structure.order == 0]
+    assert found.verdict is not None
+    if not gains or not found.verdict.backlash.known or found.verdict.model.known:
+        return found
+    chosen = min(gains, key=lambda one: one.whole.squares)
+    best = fitted(s.samples, chosen.structure, chosen.trained.fit)
+    # What depends on the model.
+    apart = s.apart + 0.5 * abs(best.gap - found.gap / units.v_size)
+    gain = _described(
+        s._replace(chosen=chosen, best=best, apart=apart), given, options, units)
+    assert gain.verdict is not None
+    known = gain.verdict.backlash.known and gain.verdict.model.known
+    if not known or apart * units.v_size >= CERTAIN * found.std['gap']:
+        return found
+    moved = sqrt(best.squares / float(np.var(best.problem.y[best.problem.known])) / len(best.left))
+    return replace(gain, uncertainty=max(gain.uncertainty, _as_parameter(2.0 * moved)))
+
+
+def _still(best: Model) -> float:
+    """Squares left over by a u that stands still, through the same G."""
+    problem, fit = best.problem, best.fit
+    theta = fit.theta.copy()
+    theta[2] = 2.0 * float(np.ptp(problem.v))
+    y = problem.explained(replace(fit, p0=float(problem.v.max()), theta=theta))
+    return max(float(np.sum((problem.y - y)[problem.known] ** 2)), TINY)
+
+
+def _as_parameter(spread: float) -> float:
+    """plant.uncertainty for a relative spread of G: one digit, upwards, and 1 % at least."""
+    value = min(max(spread, 0.01), 1.0)
+    digit = 10.0 ** np.floor(np.log10(value))
+    return float(min(round(np.ceil(value / digit - 1e-9) * digit, 6), 1.0))

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.play import LEFT, engaged, play
+from backlash_ros.core.estimation.play import play
 from backlash_ros.core.plant.numerics import lfilter
 
 Array = NDArray[np.float64]
@@ -40,6 +40,11 @@ class LinearFamily:
         bend = (v - v.mean()) / max(float(np.ptp(v)), 1e-300)
         self.common = np.column_stack([
             np.ones(len(v)), np.linspace(-1.0, 1.0, len(v)), bend**2, bend**3])[self.rows]
+
+    @property
+    def unknowns(self) -> int:
+        """Columns that are solved for."""
+        return TAPS + len(LAG_LENGTHS) + 1 + self.common.shape[1]
 
     def play(self, width: float) -> Array:
         """Play (N,) about its middle."""
@@ -108,43 +113,44 @@ class LinearFamily:
                     best, weights = Candidate(squares, (), summed), found / found.sum()
         return weights, best
 
-    def beats(self, other: Candidate, one: Candidate, noise: float, share: float) -> bool:
-        """Whether it explains a share of what one play leaves over beyond the noise."""
+    def changing(self, gap: float, basis: Array) -> tuple[Array, Candidate]:
+        """Coefficients of a basis (B, N) that make up the width of a play, from a constant one.
+
+        Gauss-Newton steps: the linear system, and the widths with it.
+        """
+        widths: Array = np.full(len(basis), max(gap, 1e-4 * float(np.ptp(self.v))))
+        best = widths, Candidate(np.inf, (), np.empty(0))
+        for _ in range(8):
+            half, place = 0.5 * np.maximum(widths @ basis, 0.0), float(self.v[0])
+            held = []
+            for low, high in zip((self.v - half).tolist(), (self.v + half).tolist(), strict=True):
+                place = min(max(place, low), high)
+                held.append(place)
+            p = np.array(held)
+            columns = self.columns(p)
+            squares, solution = self.solved(columns)
+            if not squares < best[1].squares:
+                break
+            best = widths, Candidate(squares, (), columns)
+            side = np.where(p == self.v - half, -0.5, np.where(p == self.v + half, 0.5, 0.0))
+            last = np.maximum.accumulate(np.where(side != 0.0, np.arange(len(side)), 0))
+            moved = [self.columns((side * one)[last]) @ solution[:columns.shape[1]]
+                     for one in basis]
+            widths = widths + self.solved(np.column_stack([*moved, columns]))[1][:len(basis)]
+        return best
+
+    def explains(self, other: Candidate, one: Candidate, noise: float, share: float) -> bool:
+        """Whether `other` explains this share of what `one` leaves over beyond the noise."""
         beyond = max(one.squares - noise**2 * len(self.rows), 1e-300)
         # Neighbours of smooth residuals tell little of their own.
         gain = 0.2 * len(self.rows) * np.log(one.squares / max(other.squares, 1e-300))
-        if gain < 15.0 or one.squares - other.squares < share * beyond:
-            return False
-        # What happens to fit one part of the motion does not fit the other.
+        return bool(gain >= 15.0 and one.squares - other.squares >= share * beyond)
+
+    def beats(self, other: Candidate, one: Candidate, noise: float, share: float) -> bool:
+        """The same in both halves: what happens to fit one part does not fit the other."""
         half = len(self.rows) // 2
-        return all(
+        return self.explains(other, one, noise, share) and all(
             self.solved(other.columns, part)[0]
             < (1.0 - 0.5 * share) * self.solved(one.columns, part)[0]
             for part in (slice(0, half), slice(half, None))
         )
-
-
-def gap_of_parts(
-    v: Array, y: Array, gap: float, parts: Sequence[NDArray[np.bool_]],
-) -> tuple[Array, Array]:
-    """The gap in each part of a record (flags (N,) each), and its standard deviation."""
-    family, p = LinearFamily(v, y), play(v, gap, float(v[0]) + 0.5 * gap)
-    columns = family.columns(p)
-    _, solution = family.solved(columns)
-    residual = family.target - np.column_stack([columns, family.common]) @ solution
-    # What y would do if the gap were wider in this part alone.
-    left = engaged(v, p, gap) == LEFT
-    whole = np.column_stack([
-        *(family.columns((left - 0.5) * flags) @ solution[:columns.shape[1]] for flags in parts),
-        family.common,
-    ])
-    scale = np.sqrt(np.einsum('ij,ij->j', whole, whole))
-    scale[scale == 0.0] = np.inf
-    inverse = np.linalg.pinv(whole / scale, rcond=1e-8)
-    found = inverse @ residual / scale
-    after = residual - whole @ found
-    lag = max(float(np.corrcoef(after[1:], after[:-1])[0, 1]), 0.0) if len(after) > 2 else 0.0
-    variance = float(after @ after) / max(len(after) - whole.shape[1], 1)
-    variance *= (1.0 + lag) / max(1.0 - lag, 1e-2)
-    std = np.sqrt(variance * np.einsum('ij,ij->i', inverse, inverse)) / scale
-    return gap + found[:len(parts)], std[:len(parts)]

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.fit import FIRST_STEPS
+from backlash_ros.core.identification.deviations import effective
 from backlash_ros.core.identification.structure import (
     TINY,
     Model,
@@ -212,17 +213,3 @@ def predicted(found: Model, later: Samples) -> Array:
     """Simulation over samples (M,), begun in the state and with the offset that fit them best."""
     begin = replace(found.fit, x=np.zeros(1), p0=float(found.p[-1]))
     return later.problem(found.structure).explained(begin)
-
-
-def effective(residual: Array) -> float:
-    """N' of the formula above."""
-    r = lag_one(residual)
-    return len(residual) * (1.0 - r) / (1.0 + r)
-
-
-def lag_one(residual: Array) -> float:
-    """Correlation of the residuals (R,) of successive rows, at least 0."""
-    energy = float(np.mean(residual**2)) if len(residual) > 1 else 0.0
-    if energy == 0.0 or not np.isfinite(energy):
-        return 0.0
-    return min(max(float(np.mean(residual[1:] * residual[:-1])) / energy, 0.0), 0.99)

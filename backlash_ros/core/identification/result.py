@@ -45,8 +45,7 @@ class Details(NamedTuple):
     """What pictures show, in units of the record.
 
     first: number of the first y that was fitted; v, y, p, simulated: of each y from there on, v and
-    p as they act on it. profile: gaps (G,), and the rms that G refitted to first order leaves.
-    """
+    p as they act on it. profile: gaps (G,), and the rms that G refitted to first order leaves."""
 
     first: int
     v: Array
@@ -59,11 +58,6 @@ class Details(NamedTuple):
     profile: tuple[Array, Array]
     held_out: HeldOut
 
-    @property
-    def residual(self) -> Array:
-        """y less what is simulated, nan where lost."""
-        return np.asarray(self.y - self.simulated)
-
 
 @dataclass(frozen=True)
 class Identification:
@@ -71,11 +65,11 @@ class Identification:
 
     std: deviations of gap, c_r, c_l and, for m, of the product of m and the gain of G. delays: that
     explain y equally well. quantum: step of a quantised y, 0 for none. correlation: of successive
-    residuals beyond chance. ljung_box: probability of a white residual. response_std: relative
-    deviation of G at `frequencies` [rad/sample], between which y moves. uncertainty: of G, as the
-    parameter plant.uncertainty. outliers: samples of y that were left out. reasons: why it is of no
-    use, remarks: what to know, a sentence each. details, verdict: None where nothing was fitted.
-    actuator: between the command and v; None where nothing is, or it is not known.
+    residuals beyond chance. response_std: relative deviation of G at `frequencies` [rad/sample],
+    between which y moves. uncertainty: of G, as the parameter plant.uncertainty. outliers: samples
+    of y that were left out. reasons: why it is of no use, remarks: what to know, a sentence each.
+    details, verdict: None where nothing was fitted. actuator: between the command and v; None
+    where nothing is, or it is not known.
     """
 
     sample_period: float
@@ -94,7 +88,6 @@ class Identification:
     noise_std: float = nan
     quantum: float = 0.0
     correlation: float = nan
-    ljung_box: float = nan
     frequencies: Array = field(default_factory=lambda: np.empty(0))
     response_std: Array = field(default_factory=lambda: np.empty(0))
     uncertainty: float = nan

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.fit import STEPS, Problem
+from backlash_ros.core.estimation.plant_family import padded, state_columns
 from backlash_ros.core.estimation.play import LEFT, RIGHT, play, reversals
 from backlash_ros.core.estimation.posterior import Prior, WindowFit
 from backlash_ros.core.plant.numerics import lfilter
@@ -265,7 +266,7 @@ def first_model(
     signals = np.zeros((3, count))
     signals[0] = play(problem.v, gap, p0)
     signals[1] = np.interp(np.arange(count), np.flatnonzero(known), problem.y[known])
-    signals[2, 0] = 1.0
+    signals[2] = 1.0
     columns = np.zeros((taps + poles + structure.states + 2, count))
     found = []
     for pole in filters if poles else filters[:1]:
@@ -274,14 +275,14 @@ def first_model(
             # A y over A: with an integrator in both, 1 - 1/z cancels.
             columns[-1] = back = lfilter([1.0], a, signals[1])
             whole = np.asarray(np.convolve(a, (1.0, -1.0))) if structure.integrator else a
-            moved, impulse = lfilter([1.0], whole, signals[::2])
+            moved, constant = lfilter([1.0], whole, signals[::2])
             for i in range(taps):
                 columns[i, i:] = moved[:count - i]
             for j in range(poles):
                 columns[taps + j, j + 1:] = -back[:count - j - 1]
-            columns[taps + poles] = np.cumsum(impulse)
-            for i in range(structure.states):
-                columns[taps + poles + 1 + i, i:] = impulse[:count - i]
+            columns[taps + poles] = constant
+            columns[taps + poles + 1:-1] = state_columns(
+                padded(whole, structure.states + 1).tolist(), count).T
             r = np.asarray(np.linalg.qr(columns[:, known].T, mode='r'))
             solution = np.linalg.lstsq(r[:, :-1], r[:, -1], rcond=1e-13)[0]
             a = np.append(1.0, solution[taps:taps + poles])

@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import exp, inf, log, nan, sqrt
 from typing import NamedTuple
@@ -19,11 +19,11 @@ from backlash_ros.core.estimation.fit import FEW_STEPS, FIRST_STEPS
 from backlash_ros.core.estimation.reading import step_of
 from backlash_ros.core.estimation.search import search
 from backlash_ros.core.estimation.settings import ROWS
+from backlash_ros.core.identification.deviations import by_model, effective
 from backlash_ros.core.identification.not_play import Observed, what_it_is
 from backlash_ros.core.identification.order_selection import (
     Compared,
     compare,
-    effective,
     eligible,
     gives_way,
     predicted,
@@ -44,6 +44,7 @@ from backlash_ros.core.records.readings import quantum
 from backlash_ros.core.records.samples import noise_of, outliers
 
 Array = NDArray[np.float64]
+Progress = Callable[[str], object]
 
 POLES = 3  # of the general G with which the gap is searched first; it has a tap for each delay
 EARLY, LONGEST_DELAY = (0, 1, 2, 3), 40  # delays that are compared first, and the longest
@@ -54,13 +55,10 @@ SMALLEST_GAP = 2e-3  # that is searched for, over the swing of v
 class Units(NamedTuple):
     """Middle and size of v and of y, by which both are centred and scaled."""
 
-    v: float
-    v_size: float
-    y: float
-    y_size: float
-
-
-AS_SCALED = Units(0.0, 1.0, 0.0, 1.0)
+    v: float = 0.0
+    v_size: float = 1.0
+    y: float = 0.0
+    y_size: float = 1.0
 
 
 class StructureSearch(NamedTuple):
@@ -82,11 +80,12 @@ class StructureSearch(NamedTuple):
 
 
 def searched(
-    v: Array, y: Array, options: Options, delays: Sequence[int], step: float | None = None,
-) -> Generator[str, None, StructureSearch]:
+    v: Array, y: Array, options: Options, delays: Sequence[int], progress: Progress,
+    step: float | None = None,
+) -> StructureSearch:
     """The best structure with one of these delays. step: of the readings, None: told from them."""
     far_off = 0.03  # relative distance of the last gap from the first, with which to begin anew
-    yield 'searching the gap'
+    progress('searching the gap')
     samples = Samples(v, y, max(delays) + 1, len(v), step_of(y) if step is None else step)
     cut = samples.last - round(options.held_out * samples.count)
     found = _with_general(samples, delays)
@@ -100,9 +99,9 @@ def searched(
         for delay in delays for order in options.orders if order >= integrator
     ]
     for again in (True, False):
-        yield 'comparing orders and delays'
+        progress('comparing orders and delays')
         compared = compare(samples, candidates, structures, cut)
-        yield 'refining'
+        progress('refining')
         for _ in structures:
             chosen = selected(compared)
             models, profile = _of_gaps(samples, chosen.whole)
@@ -115,7 +114,7 @@ def searched(
             break
         candidates = [best, candidates[0]]  # the general G may have been a poor one
     if best.rms > samples.step > 0.0:  # rounding is the least of what is left
-        return (yield from searched(v, y, options, delays, 0.0))
+        return searched(v, y, options, delays, progress, 0.0)
     rows = effective(best.left)
     rivals = sorted(
         (0.5 * rows * log(max(one.squares, TINY) / max(best.squares, TINY)), one.gap)
@@ -126,7 +125,8 @@ def searched(
         chosen.held_out, chosen.trained.rms)
     return StructureSearch(
         samples, compared, chosen, best, [(gap, behind) for behind, gap in rivals],
-        (profile[0], best.rms * profile[1]), held_out, delays)
+        (profile[0], best.rms * profile[1]), held_out, delays, by_model(best.gap, [
+            (one.whole.gap, one.criterion - chosen.criterion) for one in compared]))
 
 
 def _with_general(samples: Samples, delays: Sequence[int]) -> list[Model]:
@@ -182,8 +182,16 @@ def begun(found: Model) -> Model:
 
 
 def without_outliers(samples: Samples, found: Model) -> Samples:
-    """The same without readings that are none; rounding makes none."""
-    wild = outliers(found.residual, quantum(samples.fitted_y()))
+    """The same without readings that are none: far off, or the one before once more.
+
+    Rounding makes none of either.
+    """
+    y = samples.fitted_y()
+    step = quantum(y)
+    same = np.append(False, np.diff(y) == 0.0)
+    alone = same & ~np.append(False, same[:-1]) & ~np.append(same[1:], False)
+    moves = np.abs(np.diff(found.simulated, prepend=found.simulated[0]))
+    wild = outliers(found.residual, step) | alone & (moves > max(step, 0.5 * found.rms))
     if not wild.any():
         return samples
     y = samples.y.copy()
@@ -191,14 +199,14 @@ def without_outliers(samples: Samples, found: Model) -> Samples:
     return replace(samples, y=y)
 
 
-def later(early: StructureSearch, options: Options) -> Generator[str, None, StructureSearch]:
+def later(early: StructureSearch, options: Options, progress: Progress) -> StructureSearch:
     """The search among later delays, where one of them explains y as well or better.
 
     The same structure is fitted with one sample of delay more and more, from the fit before.
     """
     most_alike = 8  # delays that fit alike, beyond which none of them is told
     worse_for = 3  # delays in a row that fit worse, behind which no later one is tried
-    yield 'searching later delays'
+    progress('searching later delays')
     best, latest = early.best, min(LONGEST_DELAY, len(early.samples.v) // 20)
     samples = replace(early.samples, first=latest + 1)
     scan = [fitted(samples, best.structure, best.fit)]
@@ -215,22 +223,20 @@ def later(early: StructureSearch, options: Options) -> Generator[str, None, Stru
     first, last = (alike[k].structure.delay for k in (0, -1))
     if last <= EARLY[-1]:
         return early
-    # Their mixture.
-    share = np.array([one.squares for one in alike])
-    share = (share.min() / share) ** (0.5 * rows)
-    off = np.array([one.gap - best.gap for one in alike])
-    early = early._replace(apart=sqrt(float(share @ off**2) / float(share.sum())))
+    early = early._replace(apart=max(early.apart, by_model(best.gap, [
+        (one.gap, rows * log(max(one.squares, TINY) / max(scan[0].squares, TINY)))
+        for one in alike])))
     # What no G with a backlash explains, any delay explains a little better.
-    other = what_it_is(observed_of(early.samples, best))
+    other = what_it_is(observed_of(early.samples, best, Units()))
     if last - first > most_alike or (other is not None and not other.known):
         return early
-    late = yield from searched(early.samples.v, early.samples.y, options, range(
-        max(first - 1, 0), min(last + 2, latest) + 1))
+    late = searched(early.samples.v, early.samples.y, options, range(
+        max(first - 1, 0), min(last + 2, latest) + 1), progress)
     better = effective(late.best.left) * log(max(best.rms, TINY) / max(late.best.rms, TINY))
     return late if late.best.structure.delay < max(late.delays) and better > -ALIKE else early
 
 
-def observed_of(samples: Samples, best: Model, units: Units = AS_SCALED) -> Observed:
+def observed_of(samples: Samples, best: Model, units: Units) -> Observed:
     """The signals of a fit; v at the same samples as y."""
     v0, v_size, y0, y_size = units
     problem = best.problem

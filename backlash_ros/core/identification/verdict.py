@@ -5,12 +5,14 @@ Everything is judged by numbers and signals; nothing here knows how the fit was 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from math import log
 from typing import NamedTuple
 
 import numpy as np
 
-from backlash_ros.core.identification.linear_family import gap_of_parts
+from backlash_ros.core.identification.deviations import by_model, effective
+from backlash_ros.core.identification.linear_family import LinearFamily
 from backlash_ros.core.identification.not_play import Answer, Observed, what_it_is
 
 ROUGHLY, PRECISE = 0.25, 0.1  # relative deviations: of a gap that is known; of gain and G
@@ -48,19 +50,21 @@ class Verdict(NamedTuple):
 class Findings(NamedTuple):
     """What there is to judge by.
 
-    observed: signals of the fitted samples. gap, c_r and their standard deviations [v]. gain: mean
-    response of y to v where y moves, static: at rest (negative where y moves against v).
-    gain_std, response_std: relative deviations of the gain at rest, and of G where y moves.
-    evidence: log-likelihood by which the fit beats a u that stands still. correlation: of
-    successive residuals beyond chance. held_out, trained: rms of the errors on the samples held out
-    and on the others. rivals: other gaps with the log-likelihood by which they fall behind.
-    reversals: of p. quantum: of y, 0 for none. cancelled: poles that zeros cancel. delay [samples],
-    delay_open: whether it is the longest that was compared, and a longer one fits as well.
+    observed: signals of the fitted samples. gap, c_r and their standard deviations [v]. apart: that
+    of the gap by other structures. gain: mean response of y to v where y moves, static: at rest
+    (negative where y moves against v). gain_std, response_std: relative deviations of the gain at
+    rest, and of G where y moves. evidence: log-likelihood by which the fit beats a u that stands
+    still. correlation: of successive residuals beyond chance. held_out, trained: rms of the errors
+    on the samples held out and on the others. rivals: other gaps with the log-likelihood by which
+    they fall behind. reversals: of p. quantum: of y, 0 for none. cancelled: poles that zeros
+    cancel. delay [samples], delay_open: whether it is the longest that was compared, and a longer
+    one fits as well.
     """
 
     observed: Observed
     gap: float
     gap_std: float
+    apart: float
     c_r: float
     c_r_std: float
     gain: float
@@ -93,40 +97,61 @@ class Findings(NamedTuple):
         """Correlated part of the residual, as a motion of v."""
         # What an encoder rounds away, a twelfth with a margin, repeats itself, but is explained.
         excess = self.rms**2 - 1.5 / 12.0 * self.quantum**2
-        # Where no correlation can be told, all of it may be one.
-        correlated = self.correlation if np.isfinite(self.correlation) else 1.0
-        return float(np.sqrt(max(excess * correlated, 0.0)) / max(self.gain, 1e-300))
+        return float(np.sqrt(max(excess * self.correlation, 0.0)) / max(self.gain, 1e-300))
+
+
+class Doubt(NamedTuple):
+    """A part of the deviation of the gap [v], why it is so large, and the cure."""
+
+    deviation: float
+    why: str
+    cure: str
 
 
 def judge(f: Findings) -> Verdict:
     """The answers to three questions."""
-    other = what_it_is(f.observed)
-    # Of what moves y otherwise, by 0.3 deviations for one.
-    spread = float(np.hypot(f.gap_std, 0.3 * f.unexplained))
-    if f.delay_open:
-        # A delay that is too short by a sample looks like a gap that is wider by its motion of v.
-        spread = float(np.hypot(spread, np.abs(np.diff(f.observed.v)).mean()))
+    other, changes = what_it_is(f.observed), [*_changes(f)]
+    doubts = [*_doubts(f), *changes]
+    spread = float(np.linalg.norm([doubt.deviation for doubt in doubts]))
+    backlash = _backlash(f, other, max(doubts), spread)
     remarks = _remarks(f)
-    backlash = _backlash(f, other, spread)
-    if backlash.known and f.gap > CERTAIN * spread:
-        changes, half = _changes(f)
-        remarks += changes
-        if half > spread:
-            spread = half
-            backlash = _known_gap(f.gap, spread)
-    if backlash.known and other is not None:
-        remarks.append(other.sentence)
+    if backlash.known:
+        remarks += [doubt.why for doubt in changes]
+        remarks += [] if other is None else [other.sentence]
     return Verdict(backlash, _gain(f), _model(f), spread, tuple(remarks))
 
 
-def _known_gap(gap: float, spread: float) -> Answer:
-    return Answer(True, f'the gap is {gap:.4g} ± {spread:.2g}')
+def _doubts(f: Findings) -> list[Doubt]:
+    """What the deviation of the gap consists of."""
+    moved, o, several = f.gain * f.gap, f.observed, 'move v at several speeds and amplitudes'
+    quantised = f.quantum > moved
+    noise = f'y is quantised in steps of {f.quantum:.3g}' if quantised else \
+        f'y has a noise of {f.rms:.2g}'
+    doubts = [
+        Doubt(f.gap_std, f'{noise}, and the gap moves it by {moved:.2g}',
+              'use a finer sensor, or record for longer' if quantised else
+              'record for longer, or turn v more often'),
+        Doubt(0.3 * f.unexplained, 'something else than a backlash and a linear G moves y by '
+              f'{f.unexplained * f.gain:.2g}', 'see the residual on the page: friction, a load '
+              'that moves by itself, or a higher order with --order'),
+        Doubt(f.apart, 'other orders or delays fit nearly as well, with another gap', several),
+        # A delay that is too short by a sample looks like a gap that is wider by its motion of v.
+        Doubt(f.delay_open * float(np.abs(np.diff(o.v)).mean()), 'the delay may be a longer one',
+              'compare longer ones with --delay'),
+    ]
+    if o.unexplained and o.family is not None:
+        gap, squares = abs(o.one_play.at[0]), o.one_play.squares / len(o.family.rows)
+        rows = effective(o.residual[np.isfinite(o.residual)])
+        # Each of its columns costs as much as an unknown of any other structure.
+        behind = rows * log(squares / f.rms**2) + o.family.unknowns * log(max(rows, 1.0))
+        doubts.append(Doubt(by_model(f.gap, [(gap, behind)]),
+                            f'with another linear G it would be {gap:.3g}', several))
+    return doubts
 
 
-def _backlash(f: Findings, other: Answer | None, spread: float) -> Answer:
+def _backlash(f: Findings, other: Answer | None, most: Doubt, spread: float) -> Answer:
     """Whether the gap is known, or that there is none."""
-    # changes of the engaged side: fewer leave gap, crossings and start entangled
-    fewest_reversals = 3
+    fewest_reversals = 3  # fewer leave gap, crossings and start entangled
     if other is not None and not other.known:
         return other
     if f.evidence < SHOWS:
@@ -148,25 +173,14 @@ def _backlash(f: Findings, other: Answer | None, spread: float) -> Answer:
         if behind < 6.0 and abs(rival - f.gap) > max(5.0 * f.gap_std, ANOTHER * f.gap):
             return Answer(False, f'two gaps fit alike, {f.gap:.4g} and {rival:.4g}',
                           'move v at several speeds and amplitudes')
-    text = f'the gap, about {f.gap:.3g}, is known to ± {spread:.2g} only'
-    if f.unexplained > 0.5 * max(f.gap, CERTAIN * f.gap_std):
-        return Answer(
-            False, f'{text}: something else than a backlash and a linear G moves y by '
-            f'{f.unexplained * f.gain:.2g}', 'see the residual on the page: friction, a load that '
-            'moves by itself, or a higher order with --order',
-        )
-    if f.gap <= CERTAIN * spread:
+    unexplained = f.unexplained > 0.5 * max(f.gap, CERTAIN * f.gap_std)
+    of_noise = most.deviation <= max(f.gap_std, 0.3 * f.unexplained)
+    if f.gap <= CERTAIN * spread and of_noise and not unexplained:
         return _no_gap(f, spread)
-    if spread <= ROUGHLY * f.gap:
-        return _known_gap(f.gap, spread)
-    moved = f.gain * f.gap
-    if f.quantum > moved:
-        return Answer(
-            False, f'{text}: y is quantised in steps of {f.quantum:.3g}, and the gap moves it by '
-            f'{moved:.2g}', 'use a finer sensor, or record for longer',
-        )
-    return Answer(False, f'{text}: y has a noise of {f.rms:.2g}, and the gap moves it by '
-                  f'{moved:.2g}', 'record for longer, or turn v more often')
+    if spread <= ROUGHLY * f.gap and not unexplained:
+        return Answer(True, f'the gap is {f.gap:.4g} ± {spread:.2g}')
+    return Answer(False, f'the gap, about {f.gap:.3g}, is known to ± {spread:.2g} only: {most.why}',
+                  most.cure)
 
 
 def _no_gap(f: Findings, spread: float) -> Answer:
@@ -248,19 +262,20 @@ def _remarks(f: Findings) -> list[str]:
     ) if true]
 
 
-def _changes(f: Findings) -> tuple[list[str], float]:
-    """Where the gap is another one from part to part, and half of what it changes by."""
-    parts = 3  # of the time, and of the place, in which the gap is compared
+def _changes(f: Findings) -> Iterator[Doubt]:
+    """Where the gap is another one from part to part: what no constant gap explains."""
     o = f.observed
-    if not o.unexplained and f.unexplained < WORTH_A_WORD * f.gap:
-        return [], 0.0
-    place = np.searchsorted(np.quantile(o.p, np.arange(1, parts) / parts), o.p)
-    time = parts * np.arange(len(o.v)) // len(o.v)
-    found, half = [], 0.0
-    for part, what in ((time, 'within the record'), (place, 'with the place, from left to right')):
-        gaps, std = gap_of_parts(o.v, o.y, o.gap, [part == k for k in range(parts)])
-        apart, deviation = float(np.ptp(gaps)), float(std.max())
-        if apart > max(0.1 * f.gap, 5.0 * deviation) and gaps.min() > -deviation:
-            found.append(f'the gap changes {what}: ' + ', '.join(f'{gap:.3g}' for gap in gaps))
-            half = max(half, 0.5 * apart)
-    return found, half
+    if not o.unexplained and f.unexplained <= WORTH_A_WORD * f.gap:
+        return
+    family = LinearFamily(o.v, o.y)
+    _, one = family.changing(f.gap, np.ones((1, len(o.v))))
+    for over, knots, what in ((np.arange(len(o.v)), 3, 'within the record'),
+                              (o.v, 5, 'with the place, from left to right')):
+        at = np.linspace(over.min(), over.max(), knots)
+        hats = np.array([np.interp(over, at, row) for row in np.eye(knots)])
+        gaps, other = family.changing(f.gap, hats)
+        gaps = np.maximum(gaps, 0.0)
+        if np.ptp(gaps) > 0.1 * f.gap and family.explains(other, one, o.noise, 0.5):
+            yield Doubt(float(np.sqrt(np.mean((gaps @ hats - f.gap) ** 2))),
+                        f'the gap changes {what}: ' + ', '.join(f'{gap:.3g}' for gap in gaps),
+                        'move v where it is one and the same')

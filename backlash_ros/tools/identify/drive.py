@@ -11,6 +11,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from math import inf
 from pathlib import Path
@@ -28,7 +29,7 @@ from backlash_ros.middleware.installed import ROS_MISSING, ros_is_missing
 from backlash_ros.options import BAD_INPUT
 from backlash_ros.tools.cli import BrokenOffError, InputError, StopRequests
 from backlash_ros.tools.config import write_config
-from backlash_ros.tools.identify.outcome import identifying_record
+from backlash_ros.tools.identify.outcome import identify_record
 from backlash_ros.tools.records.messages import FEWEST_MESSAGES, from_messages
 
 
@@ -110,19 +111,23 @@ class _Estimate(threading.Thread):
         super().__init__(daemon=True)
         self.found: Identification | None = None
         self.given_up = False
-        self._work = identifying_record(replace(record, commands=None), options)
+        self._record, self._options = replace(record, commands=None), options
         self.start()
 
     def run(self) -> None:
         """Look, until it is known or given up."""
         if sys.platform == 'linux':
             os.nice(5)  # this thread alone gives way to the driver and to what moves it
-        while not self.given_up:
-            try:
-                next(self._work)
-            except StopIteration as done:
-                self.found = done.value
-                return
+        with suppress(_GivenUpError):
+            self.found = identify_record(self._record, self._options, self._go_on)
+
+    def _go_on(self, _: str) -> None:
+        if self.given_up:
+            raise _GivenUpError
+
+
+class _GivenUpError(Exception):
+    """Nobody asks for the estimate any more."""
 
 
 def _follow(

@@ -165,7 +165,7 @@ def numbers(found: Identification) -> dict[str, Any]:
             'numerator': actuator.lag.numerator.tolist(),
             'denominator': actuator.lag.denominator.tolist(), 'wind_up': list(actuator.wind_up),
         },
-        'residual': {'lag_one_correlation': found.correlation, 'ljung_box_p': found.ljung_box},
+        'residual': {'lag_one_correlation': found.correlation},
         'samples': len(found.y), 'lost_samples': int(np.isnan(found.y).sum()),
         'outliers': found.outliers,
     }

@@ -5,10 +5,9 @@ from __future__ import annotations
 import argparse
 import signal
 import sys
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from html import escape
-from math import isfinite
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,7 @@ from tqdm import tqdm
 from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core.estimates_file import save_estimate
 from backlash_ros.core.identification.actuator import with_actuator
-from backlash_ros.core.identification.identification import identifying
+from backlash_ros.core.identification.identification import identify
 from backlash_ros.core.identification.result import Details, Identification, Options
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.parameter import Value
@@ -38,29 +37,23 @@ from backlash_ros.tools.runs.files import result_directory, write_summary, write
 YAML, JSON, PAGE = 'identified.yaml', 'identified.json', 'identify.html'
 
 
-def identifying_record(
-    record: Record, options: argparse.Namespace,
-) -> Generator[str, None, Identification]:
-    """Identify with what the command line says; yields what is being done."""
-    found = yield from identifying(record.v, record.y, record.sample_period, Options(
-        options.order, options.delay,
-        {'auto': (False, True), 'yes': (True,), 'no': (False,)}[options.integrator], options.slope,
-    ))
+def identify_record(
+    record: Record, options: argparse.Namespace, progress: Callable[[str], object],
+) -> Identification:
+    """Identify with what the command line says. progress: is told what is being done."""
+    integrators = {'auto': (False, True), 'yes': (True,), 'no': (False,)}[options.integrator]
+    found = identify(record.v, record.y, record.sample_period, Options(
+        options.order, options.delay, integrators, options.slope), progress)
     return found if record.commands is None else with_actuator(found, record.commands)
 
 
 def identified(record: Record, options: argparse.Namespace) -> Identification:
     """Identify, with a bar on a terminal; raises BrokenOffError."""
-    work = identifying_record(record, options)
     with tqdm(file=sys.stderr, disable=None, leave=False, bar_format='{desc}: {elapsed}') as bar:
-        while True:
-            try:
-                bar.set_description_str(next(work))
-            except StopIteration as done:
-                found: Identification = done.value
-                return found
-            except np.linalg.LinAlgError as error:
-                raise BrokenOffError(f'the record cannot be fitted: {error}') from error
+        try:
+            return identify_record(record, options, bar.set_description_str)
+        except np.linalg.LinAlgError as error:
+            raise BrokenOffError(f'the record cannot be fitted: {error}') from error
 
 
 def write_outcome(
@@ -179,8 +172,7 @@ def _facts(found: Identification, record: Record) -> str:
         ('noise of y', f'{found.noise_std:.3g}{quantum}'),
         ('error on samples held out', NOTHING if held_out is None else
          f'{held_out.rms:.3g} (fit: {held_out.trained:.3g})'),
-        ('correlation of the residual', f'{found.correlation:.2g} from sample to sample'
-         if isfinite(found.correlation) else NOTHING),
+        ('correlation of the residual', f'{found.correlation:.2g} from sample to sample'),
         ('lost samples, outliers', f'{record.lost}, {found.outliers}'),
     ], columns=1)
 

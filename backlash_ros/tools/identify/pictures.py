@@ -119,7 +119,7 @@ def draw_residual(figure: Figure, found: Identification, details: Details) -> No
     grid = figure.add_gridspec(2, 2)
     over_time = figure.add_subplot(grid[0, :])
     correlated, over_v = figure.add_subplot(grid[1, 0]), figure.add_subplot(grid[1, 1])
-    residual, v = details.residual, details.v
+    residual, v = details.y - details.simulated, details.v
     t = found.sample_period * (details.first + np.arange(len(residual), dtype=float))
     curve(over_time, t, residual, HUES['e'], width=0.8)
     label(over_time, f'Deviation {found.noise_std:.3g}', 'residual', TIME_LABEL)
@@ -128,7 +128,7 @@ def draw_residual(figure: Figure, found: Identification, details: Details) -> No
     correlated.axhspan(-bound, bound, color='#bbbbbb', alpha=0.5, linewidth=0)
     correlated.vlines(np.arange(1, len(r) + 1), 0.0, r, color=HUES['e'], linewidth=1.5)
     correlated.set_ylim(*limits([np.append(r, [-3.0 * bound, 3.0 * bound])], 0.1))
-    label(correlated, f'Autocorrelation (Ljung–Box p = {found.ljung_box:.2g})', '', 'lag [samples]')
+    label(correlated, 'Autocorrelation', '', 'lag [samples]')
     over_v.plot(v, residual, '.', color=HUES['e'], markersize=2, alpha=0.4, rasterized=True)
     known = np.isfinite(residual)
     edges = np.linspace(v.min(), v.max(), 26)

@@ -88,6 +88,16 @@ def test_lost_samples_and_outliers_do_not_matter() -> None:
     assert found.denominator == pytest.approx((1.0, -1.7, 0.755), abs=0.01)
 
 
+def test_readings_that_come_twice_make_no_gap_wider() -> None:
+    v, y = record()
+    again = 1 + np.flatnonzero(np.random.default_rng(3).random(len(y) - 1) < 0.08)
+    for k in again:
+        y[k] = y[k - 1]
+    found = identify(v, y, PERIOD_S, QUICK)
+    assert found.outliers > 0.6 * len(again)
+    assert abs(found.gap - 0.9) < 2.5 * found.std['gap'] < 0.01
+
+
 @pytest.mark.filterwarnings('error')
 @pytest.mark.parametrize('every', [2, 5])
 def test_a_y_that_is_read_every_few_samples_alone_is_enough(every: int) -> None:

@@ -7,8 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from backlash_ros.core.estimation import play as operator
-from backlash_ros.core.identification.linear_family import gap_of_parts
+from backlash_ros.core.identification.linear_family import LinearFamily
 from backlash_ros.core.identification.not_play import SYMPTOMS, Observed, what_it_is
 
 Array = NDArray[np.float64]
@@ -27,8 +26,13 @@ PLANTS: dict[str, tuple[list[float], list[float]]] = {
 }
 
 
-def play(v: Array, gap: float) -> Array:
-    return operator.play(v, gap, float(v[0]) + 0.5 * gap) - 0.5 * gap
+def play(v: Array, gap: Array | float) -> Array:
+    """Of one width, or of one for each sample."""
+    place, out = float(v[0]), []
+    for value, half in np.broadcast(v, 0.5 * np.asarray(gap)):
+        place = min(max(place, value - half), value + half)
+        out.append(place)
+    return np.array(out)
 
 
 def dead_zone(v: Array) -> Array:
@@ -153,13 +157,19 @@ def test_a_load_that_coasts_through_the_gap_is_named_and_leaves_a_play() -> None
     assert 'it coasts there' in answer.reason
 
 
-def thirds() -> list[NDArray[np.bool_]]:
-    return [k == K // 1000 for k in range(3)]
-
-
 @pytest.mark.parametrize('plant', ['gain', 'lag', 'two lags'])
-def test_the_gap_of_each_part_is_told(plant: str) -> None:
-    u = np.where(K < 2000, play(V, GAP), play(V, 0.75))
-    found, std = gap_of_parts(V, behind(u, plant), GAP, thirds())
-    assert found - found[0] == pytest.approx([0.0, 0.0, 0.15], abs=0.02)
-    assert std.max() < 0.02
+def test_a_gap_that_grows_is_told_from_part_to_part(plant: str) -> None:
+    family = LinearFamily(V, behind(play(V, np.linspace(0.5, 0.8, COUNT)), plant))
+    ramp = np.linspace(0.0, 1.0, COUNT)
+    gaps, found = family.changing(GAP, np.array([1.0 - ramp, ramp]))
+    assert gaps == pytest.approx([0.5, 0.8], abs=0.02)
+    assert family.explains(found, family.changing(GAP, np.ones((1, COUNT)))[1], NOISE, 0.5)
+
+
+def test_a_gap_on_a_part_of_the_way_is_told_though_none_fits_best() -> None:
+    width = 0.2 * (1.0 + np.cos(1.3 * V))
+    family = LinearFamily(V, behind(play(V, width), 'lag'))
+    gaps, _ = family.changing(0.0, np.array([
+        np.interp(V, np.linspace(V.min(), V.max(), 5), row) for row in np.eye(5)]))
+    assert gaps.argmax() == 2
+    assert gaps[2] == pytest.approx(0.4, abs=0.1)
