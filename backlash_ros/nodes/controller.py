@@ -113,9 +113,13 @@ class ControllerNode(ManagedNode):
         let_parameters_change(self, self._check_change, self._take_up, lambda: self.loops is None)
         # One joint at a time: all at once would hold up a command.
         turn = cycle(self.joints)
+
+        def look_and_tell() -> None:
+            self._steps.look()
+            next(turn).diagnose(self._rivals, self.active)
+
         self.create_timer(
-            DIAGNOSTICS_PERIOD_S / len(self.joints),
-            lambda: next(turn).diagnose(self._rivals, self.active), clock=self.steady_clock,
+            DIAGNOSTICS_PERIOD_S / len(self.joints), look_and_tell, clock=self.steady_clock
         )
         if not p.lockstep:
             self.create_timer(0.1, self._look_for_silence, clock=self.steady_clock)
@@ -194,7 +198,8 @@ class ControllerNode(ManagedNode):
         def all_there() -> bool:
             # Beside the driver, those who listen want to hear everything.
             return not wanted or (
-                io.listeners >= wanted and self._steps.listeners >= wanted - 1
+                io.publisher.get_subscription_count() >= wanted
+                and self._steps.listeners >= wanted - 1
                 and (self.count_publishers(io.topics.reference) > 0 if lockstep
                      else all(loop.heard.y_m_at is not None for loop in self.configured))
             )
@@ -315,7 +320,6 @@ class ControllerNode(ManagedNode):
             steps = loops.answer({'': pair[0]}, pair[1])
             if steps:
                 loops.by_name[''].core.refine()
-                self._steps.look()
                 self._follow_up(loops, steps)
 
     def _follow_up(self, loops: JointLoops, steps: Mapping[str, ControlStep]) -> None:
@@ -367,7 +371,6 @@ class ControllerNode(ManagedNode):
         if loops is None or not self.active:
             return
         self._io.serve_waiting()
-        self._steps.look()
         for joint in self.joints:
             joint.save_now_and_then()
         if loops.give_up_silent():

@@ -84,7 +84,7 @@ def figures_of(
     if io.simulated_time:
         # Stamps of simulated time have nothing to do with the time of arrival.
         figures.age_s = nan
-    if io.in_joint_space:
+    if p.io.style == 'joint_state_topic':
         # Hardware on topics falls silent where all joints are where they belong.
         figures.reference_silent_s = 0.0
     return replace(

@@ -105,14 +105,15 @@ class DriverIo:
     Joints are told apart by name; the only one of a controller without `joints` is nameless, and
     io.joint says what it is called in messages.
 
-    skipped: messages in a row without a joint. seen: the joints of the newest of these.
-    simulated_time: whether stamps are those of /clock. publisher: of v, once it is advertised.
+    joint_names: in the order of their commands in an array. skipped: messages in a row without a
+    joint. seen: the joints of the newest of these. simulated_time: whether stamps are those of
+    /clock. publisher: of v, once it is advertised.
     """
 
     publisher: Publisher
 
     def __init__(self, node: ProcessNode, p: Parameters) -> None:
-        self.topics = driver_topics(p)
+        self.topics, self.joint_names = driver_topics(p), p.joint_names
         self.skipped, self.seen = dict.fromkeys(p.joint_names, 0), ''
         self.stamps = HeaderStamps()
         # On simulated time the stamps of the middleware, which are real time, say nothing.
@@ -123,24 +124,9 @@ class DriverIo:
         self._heard: dict[str, Subscription] = {}  # by what they are about
 
     @property
-    def joint_names(self) -> tuple[str, ...]:
-        """The joints of the node, in the order of their commands in an array."""
-        return self._p.joint_names
-
-    @property
-    def listeners(self) -> int:
-        """How many subscribers v has."""
-        return self.publisher.get_subscription_count()
-
-    @property
     def is_simulated(self) -> bool:
         """Whether y comes from the plant of this package: no other one tells the truth."""
         return self._node.count_publishers(topics.TRUTH) > 0
-
-    @property
-    def in_joint_space(self) -> bool:
-        """Whether v is where the joint is to go, in the unit of y."""
-        return self._p.io.style == 'joint_state_topic'
 
     def now_ns(self) -> int:
         """Time on the clock of the stamps."""
@@ -192,17 +178,16 @@ class DriverIo:
         self, hear: Callable[[Mapping[str, float]], None], qos: QoSProfile | int, polled: bool,
     ) -> None:
         """Call hear with every y_m. polled: when serve_waiting is called."""
-        def hear_number(message: bytes, info: dict[str, Any]) -> None:
-            hear({'': number_of(message)})
-
-        def hear_joints(message: JointState, info: dict[str, Any]) -> None:
-            self._referred = message
-            hear(self.values(message))
-
         of_joints = self.topics.reference_type is JointState
+
+        def hear_values(message: bytes | JointState, info: dict[str, Any]) -> None:
+            if of_joints:
+                self._referred = message
+            hear(self.values(message) if of_joints else {'': number_of(message)})
+
         self._heard['references'] = self._node.listen(
-            self.topics.reference_type, self.topics.reference,
-            hear_joints if of_joints else hear_number, qos, raw=not of_joints, polled=polled,
+            self.topics.reference_type, self.topics.reference, hear_values, qos, not of_joints,
+            polled,
         )
 
     @property

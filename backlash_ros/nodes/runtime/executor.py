@@ -114,6 +114,8 @@ class PromptExecutor(SingleThreadedExecutor):
             except InvalidHandle:  # the callback of another one has destroyed it
                 continue
             timer.callback()
+            if time.monotonic_ns() > now + 1_000_000:
+                return  # a message may wait: what else is due comes after it
         if now + ahead_ns >= self._rclpy_at_ns:
             self._rclpy_at_ns = now + (0 if self._serve_rest() else look_ns)
         due = [timer.time_until_next_call() for timer in self._node.timers]
