@@ -100,7 +100,9 @@ def number_of_samples(parameters: Parameters, duration: float | None) -> int:
     return samples
 
 
-def run_tool(name: str, tool: Callable[[], None]) -> int:
+def run_tool(
+    name: str, tool: Callable[[Sequence[str] | None], None], args: Sequence[str] | None = None,
+) -> int:
     """Run a tool and return its exit code; whatever stops it becomes one line on stderr.
 
     Call it from the main thread: a SIGTERM stops the tool as a Ctrl-C does.
@@ -109,7 +111,7 @@ def run_tool(name: str, tool: Callable[[], None]) -> int:
     # The interpreter takes a while to end, in which another Ctrl-C would change the exit code.
     atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
     try:
-        tool()
+        tool(args)
         return DONE
     except (ParameterError, InputError) as error:
         message, code = str(error), BAD_INPUT

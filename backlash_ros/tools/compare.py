@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from string import Template
 from typing import NamedTuple
@@ -164,9 +165,7 @@ def _compare(args: Sequence[str] | None) -> None:
     print(f'document: {document}')
 
 
-def main(args: Sequence[str] | None = None) -> int:
-    return cli.run_tool('compare', lambda: _compare(args))
-
+main = partial(cli.run_tool, 'compare', _compare)
 
 if __name__ == '__main__':
     sys.exit(main())

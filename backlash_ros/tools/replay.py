@@ -6,6 +6,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from math import isnan, nan
 from pathlib import Path
 
@@ -72,11 +73,6 @@ def make_parser() -> argparse.ArgumentParser:
                         dest='settings', help='change one parameter; may be given again')
     cli.add_options(parser, '--sweep', '--axis', '--from', '--to', '--out')
     return parser
-
-
-def main(args: Sequence[str] | None = None) -> int:
-    """Entry point of `replay`."""
-    return cli.run_tool('replay', lambda: _replay(args))
 
 
 def _replay(args: Sequence[str] | None) -> None:
@@ -200,6 +196,8 @@ def draw_replay(recorded: RunRecord, replayed: RunRecord) -> Figure:
     grid[-1, 0].set_yticks([int(state) for state in Status], [state.word for state in Status])
     return figure
 
+
+main = partial(cli.run_tool, 'replay', _replay)
 
 if __name__ == '__main__':
     sys.exit(main())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -211,9 +212,7 @@ def _report(args: Sequence[str] | None) -> None:
     print(out / REPORT_PAGE)
 
 
-def main(args: Sequence[str] | None = None) -> int:
-    return cli.run_tool('report', lambda: _report(args))
-
+main = partial(cli.run_tool, 'report', _report)
 
 if __name__ == '__main__':
     sys.exit(main())

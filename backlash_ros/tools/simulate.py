@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Mapping, Sequence
+from functools import partial
 from math import isfinite
 
 from tqdm import tqdm
@@ -137,9 +138,7 @@ def _seconds(time: float) -> str:
     return f'{time:.4g} s' if isfinite(time) else 'never'
 
 
-def main(args: Sequence[str] | None = None) -> int:
-    return cli.run_tool('simulate', lambda: _simulate(args))
-
+main = partial(cli.run_tool, 'simulate', _simulate)
 
 if __name__ == '__main__':
     sys.exit(main())

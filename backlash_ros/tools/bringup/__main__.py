@@ -75,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
-    def bringup() -> None:
+    def bringup(arguments: Sequence[str] | None) -> None:
         nonlocal code
         options = parse_options(arguments)
         with StopRequests() as requests:
@@ -85,7 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         reported = [axis.made > 0 and report(axis.plan) for axis in watch.axes.values()]
         code = DONE if all(reported) and not watch.failure else FAILED
 
-    return cli.run_tool('bringup', bringup) or code
+    return cli.run_tool('bringup', bringup, arguments) or code
 
 
 def run(plan: RunPlan, requests: StopRequests) -> RunWatch:

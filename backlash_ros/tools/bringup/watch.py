@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import sys
 import time
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import inf
@@ -69,8 +70,7 @@ class AxisProgress:
     @property
     def unheard(self) -> dict[str, int]:
         """What is missing of the published ones."""
-        missing = {what: n - self.heard.get(what, 0) for what, n in (self.published or {}).items()}
-        return {what: n for what, n in missing.items() if n > 0}
+        return Counter(self.published or {}) - Counter(self.heard)
 
     def begin(self) -> None:
         self.began = self.moved = time.monotonic()

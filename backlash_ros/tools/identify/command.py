@@ -78,7 +78,7 @@ def main(args: Sequence[str] | None = None) -> int:
     os.environ.setdefault('OMP_NUM_THREADS', '1')
     os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
     known: list[bool] = []
-    code = run_tool('identify', lambda: known.append(_identify(args)))
+    code = run_tool('identify', lambda given: known.append(_identify(given)), args)
     return FAILED if known == [False] else code
 
 
