@@ -117,8 +117,8 @@ def afresh(
     fits: list[WindowFit] = []
     # Once more around G as the best of the first gaps has it.
     again = family.count > 0 and like is None and not hopeless
-    for last in (False, True) if again else (True,):
-        found, null = search(family, record.v, record.y, setup.noise_std, setup.widest, xi, last)
+    for _ in range(1 + again):
+        found, null = search(family, record.v, record.y, setup.noise_std, setup.widest, xi)
         if not found or (not fits and found[0].evidence < null + settings.ENGAGED):
             break
         gaps: list[float] = []
@@ -145,7 +145,6 @@ def afresh(
     best = max(fits, key=lambda f: f.evidence)
     if best.m < 0.0 or hopeless:
         return best
-    best = begun_elsewhere(p, best)
     best = with_intervals(p, best)
     best = replace(best, spread=spread(p, best, fits))
     return with_walk(setup, p, best) if walks else best
@@ -212,23 +211,11 @@ def with_walk(setup: Setup, p: Problem, f: WindowFit) -> WindowFit:
         walking = p.walking(walk_std)
         begin = replace(f.without_intervals, knots=np.zeros(0))
         g = with_intervals(walking, walking.fitted(begin, FIRST_STEPS))
-        if g.valid and g.evidence > best.evidence + (0.0 if best.walk_std > least else FAR_BEHIND):
+        needed = 0.0 if best.walk_std > least else FAR_BEHIND
+        # Readings of which the walk leaves a correlated rest count as fewer.
+        if g.valid and g.evidence - best.evidence > needed * g.inflation:
             best = g
     return best
-
-
-def begun_elsewhere(p: Problem, f: WindowFit) -> WindowFit:
-    """The fit, or one with another beginning: y has a minimum wherever v has turned meanwhile."""
-    beginnings = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the play in its gap, that are compared with a fit
-    likeliest, value = f, p.log_posterior(f) + 1.0
-    weights = p.weights(f)
-    for share in beginnings:
-        other = replace(f, p0=float(p.v[0]) + share * f.gap, x=np.zeros(len(f.x)))
-        other = replace(other, x=p.state(other))
-        of_other = p.log_posterior(other, weights)
-        if of_other > value:
-            likeliest, value = other, of_other
-    return f if likeliest is f else p.finished(p.fitted(likeliest))
 
 
 def spread(p: Problem, best: WindowFit, others: Sequence[WindowFit] = ()) -> Array:

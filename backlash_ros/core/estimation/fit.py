@@ -372,8 +372,7 @@ class Problem:
         whole = score / sqrt(float(information[known].mean())) if f.step else r / f.noise_std
         e = np.add.reduceat((whole * w)[known], begins)  # of what counts as one reading
         squares = max(float(e @ e), 1e-300)
-        lags = (1, 2, 4, 8) if f.step else (1,)
-        rho = max(float(e[lag:] @ e[:-lag]) / squares for lag in lags if lag < len(e))
+        rho = max(abs(float(e[lag:] @ e[:-lag])) / squares for lag in (1, 2, 4, 8) if lag < len(e))
         rho = max(0.0, rho - 3.0 / sqrt(max(count, 1.0)))
         rho *= min(1.0, squares / max(count, 1.0))  # below the noise there may be anything
         return replace(

@@ -1,7 +1,8 @@
 """Where to begin a fit: gaps and beginnings, by the evidence of all else in closed form.
 
-For a gap g and a beginning p0, y is linear in the state, o, m and m xi (to first order in xi): one
-QR for each of some 300 hypotheses. Rows are averaged to some 1,500, as densely as v moves.
+For a gap g and a beginning p0, y is linear in the state, o, m, m xi, and m times what p0 is off by
+(to first order in both): one QR for each of some 200 hypotheses. Rows are averaged to some 1,500,
+as densely as v moves.
 """
 
 from __future__ import annotations
@@ -31,35 +32,26 @@ class Hypothesis(NamedTuple):
 
 def search(
     family: Family, v: Array, y: Array, noise_std: float, widest: float, xi: Array,
-    closely: bool, smallest: float = 0.01,
+    smallest: float = 0.01,
 ) -> tuple[list[Hypothesis], float]:
     """Hypotheses, and the evidence of a u that never moves.
 
     The likeliest one and those of other gaps that are likelier than their neighbours come first.
 
     v, y: (N,), y nan where lost. widest: gap that is considered. xi: error of G (K,), around which
-    G is linearized. closely: whether to look once more around the best gap. smallest: gap that is
-    compared, over the swing of v.
+    G is linearized. smallest: gap that is compared, over the swing of v.
     """
     none = 1e-9  # gap that counts as none, over the swing of v
-    peaks = 3  # that come first
     compared = _Comparison(family, v, y, noise_std, xi.tolist())
     swing = float(np.ptp(v))
     top = min(swing, widest)
     gaps: Array = np.append(none * swing, np.geomspace(smallest * min(swing, top), top, 32))
-    # Within each gap. Where a record is short, a large part of it is before the first engagement,
-    # which a beginning that is a little off puts somewhere else.
-    most = 16 if closely and len(v) <= 500 else 4
-    starts: Array = np.arange(most + 1) / most
+    starts: Array = np.arange(5) / 4.0  # within each gap
     found = [h for h in compared.evidence(gaps, starts) if isfinite(h.evidence)]
     if not found:
         return [], compared.null
-    between, closer = 0.5 * (starts[1:] + starts[:-1]), []
-    if closely:
-        near = [max(found).gap * (0.8 + 0.025 * k) for k in range(17)]
-        closer = compared.evidence(np.array(near), np.append(starts, between))
-    first = sorted({max([*closer, max(found)]), *_peaks(found)}, reverse=True)[:peaks]
-    return [*first, *sorted({*closer, *found} - {*first}, reverse=True)], compared.null
+    first = sorted(_peaks(found), reverse=True)[:3]
+    return [*first, *sorted({*found} - {*first}, reverse=True)], compared.null
 
 
 def _peaks(found: list[Hypothesis]) -> list[Hypothesis]:
@@ -111,43 +103,53 @@ class _Comparison:
         g = np.repeat(gaps, len(shares))
         begins = self._v[0] + np.tile(shares, len(gaps)) * g
         p = plays(self._v, g, begins)
-        once = lfilter([1.0], self._a, p)
-        of_y = lfilter(self._b, [1.0], once)
-        columns = [self._averaged(of_y)]
+        begun = np.logical_and.accumulate(p == p[:, :1], axis=1).astype(np.float64)
+        once = lfilter([1.0], self._a, np.stack([p, begun], axis=1))
+        of_u = lfilter(self._b, [1.0], once)
+        columns = [self._averaged(of_u)]
         if self._family.count:
             # xi changes no constant part of u: that keeps to o.
             move = lfilter([1.0], self._a, p - p[:, :1])
             y_over_a = lfilter([1.0], self._a, lfilter(self._b, [1.0], move))
             for db, da in zip(*self._slopes, strict=True):
                 column = lfilter(db, [1.0], move) - lfilter(da, [1.0], y_over_a)
-                columns.append(self._averaged(column))
-        stack = self._without_common(np.stack(columns, axis=1))
+                columns.append(self._averaged(column)[:, None])
+        stack = self._without_common(np.concatenate(columns, axis=1))
         y = np.broadcast_to(self._y, (len(g), 1, self._rows))
         r = _triangles(np.concatenate([stack, y], axis=1).transpose(0, 2, 1))
-        m = r[:, 0, -1] / r[:, 0, 0]
-        best = self._weighed(r, np.abs(m)).reshape(len(gaps), -1)
+        noise = np.sqrt((r[:, -1, -1] ** 2 + self._nominal**2) / self._freedom)
+        m = np.abs(r[:, 0, -1] / r[:, 0, 0]) + 1e-30
+        # p0 is anywhere within the gap.
+        prior = np.zeros((len(r), 1, r.shape[2]))
+        prior[:, 0, 1] = of_begin = noise * 12.0**0.5 / (m * g)
+        r = _triangles(np.concatenate([r, prior], axis=1))
+        off = r[:, 1, -1] / r[:, 1, 1]
+        slope = (r[:, 0, -1] - r[:, 0, 1] * off) / r[:, 0, 0]
+        p0 = np.clip(begins + off / slope, self._v[0], self._v[0] + g)
+        volume = np.log(of_begin / np.abs(r[:, 1, 1]))
+        best = (self._weighed(r, noise, np.abs(slope)) + volume).reshape(len(gaps), -1)
         at = best.argmax(axis=1) + np.arange(len(gaps)) * len(shares)
         return [
-            Hypothesis(float(best.ravel()[i]), float(g[i]), float(begins[i]), float(m[i]))
+            Hypothesis(float(best.ravel()[i]), float(g[i]), float(p0[i]), float(slope[i]))
             for i in at
         ]
 
-    def _weighed(self, r: Array, m: Array) -> Array:
-        """Evidence (H,) from triangles (H, K + 2, K + 2), at the best scale of the error of G."""
+    def _weighed(self, r: Array, noise: Array, m: Array) -> Array:
+        """Evidence (H,) from triangles (H, K + 3, K + 3), at the best scale of the error of G."""
         k, freedom = self._family.count, self._freedom
-        noise = np.sqrt((r[:, -1, -1] ** 2 + self._nominal**2) / freedom)
         if not k:
-            return -0.5 * freedom * np.log(noise**2 * freedom / self._rows)
+            left = r[:, -1, -1] ** 2 + self._nominal**2
+            return np.asarray(-0.5 * freedom * np.log(left / self._rows))
         best = np.full(len(r), -np.inf)
         i = np.arange(k)
         for scale in (0.03, 0.3, 1.0):  # of the error of G that are weighed
             weight = noise / (scale * m + 1e-30)
-            prior = np.zeros((len(r), k, k + 2))
-            prior[:, i, i + 1] = weight[:, None]
+            prior = np.zeros((len(r), k, k + 3))
+            prior[:, i, i + 2] = weight[:, None]
             s = _triangles(np.concatenate([r, prior], axis=1))
             value = -0.5 * freedom * np.log((s[:, -1, -1] ** 2 + self._nominal**2) / self._rows)
             value += k * np.log(weight) - 0.5 * scale**2
-            value -= np.log(np.abs(s[:, i + 1, i + 1]) + 1e-300).sum(axis=1)
+            value -= np.log(np.abs(s[:, i + 2, i + 2]) + 1e-300).sum(axis=1)
             best = np.maximum(best, value)
         return best
 

@@ -29,6 +29,7 @@ LASTING = 8.0  # times what it had to predict, over which an explanation holds f
 # --- how much is looked at
 FIRST_FIT = 20  # samples before the first search
 GROWTH = 1.25  # of the record from one search to the next
+SEARCHED = 2.0  # of one of many reversals that a search has not explained
 BLOCKS = 16  # refits while the record doubles: one for so many of its samples
 FEWEST = 8  # samples between two refits
 LIVELY = 1500  # samples that are kept though fewer hold enough reversals

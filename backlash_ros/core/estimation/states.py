@@ -45,7 +45,7 @@ from backlash_ros.core.estimation.fit import FEW_STEPS, Problem
 from backlash_ros.core.estimation.late_commands import likelier
 from backlash_ros.core.estimation.play import engaged, play, reversals
 from backlash_ros.core.estimation.posterior import WindowFit
-from backlash_ros.core.estimation.settings import FEWEST, GROWTH, MISFIT, PREDICTED
+from backlash_ros.core.estimation.settings import FEWEST, MISFIT, PREDICTED
 
 Array = NDArray[np.float64]
 
@@ -82,7 +82,10 @@ def _searching(setup: Setup, record: Window, before: Belief) -> Belief:
     shortest = 50  # samples of a part of a record that is searched alone
     count, tried = len(record.v), before.tried
     soon = record.end + max(count // settings.BLOCKS, FEWEST)
-    search_at = record.end + max(int(count * (GROWTH - 1.0)), FEWEST)
+    # What many reversals do not tell, a few more will not.
+    lasting = tried is not None and tried.turns >= settings.HELD_REVERSALS
+    growth = settings.SEARCHED if lasting else settings.GROWTH
+    search_at = record.end + max(int(count * (growth - 1.0)), FEWEST)
     after = replace(before, end=record.end, next_at=search_at, thorough_at=search_at)
     if tried is not None and before.candidate is None and record.end < before.thorough_at \
             and not is_known(setup, tried, _turns(record, max(tried.gap, 0.0), tried.p0)):
@@ -250,22 +253,27 @@ def _contradicts(problem: Problem, held: WindowFit, fit: WindowFit, new: int) ->
 
     They do as well where it takes them in at the cost of all others.
     """
-    from scipy.special import chdtri  # where fits are made: 31 MB
-
-    weights = problem.weights(fit)[new:]
+    weights = problem.weights(fit)
     z = problem.residual(fit) / held.noise
-    if float(np.nanmean(z**2)) > settings.AS_GOOD**2:
+    if float(np.nanmean(z**2)) > _most(settings.AS_GOOD**2, float(weights.sum()), held):
         return True
-    z = z[new:]
+    weights, z = weights[new:], z[new:]
     seen = np.isfinite(z)
     count = float(weights[seen].sum())
     if not count:
         return False
     wild = np.abs(z) > settings.GATE
     mean = float(np.nansum(weights * np.where(wild, 0.0, z**2))) / count
-    free = max(count, 1.0)
-    limit = max(MISFIT, float(chdtri(free, 1e-5)) / free)  # less probable by chance
-    return mean > limit or float(wild.sum()) > settings.OUTLIER_SHARE * int(seen.sum())
+    return mean > _most(MISFIT, count, held) \
+        or float(wild.sum()) > settings.OUTLIER_SHARE * int(seen.sum())
+
+
+def _most(least: float, count: float, held: WindowFit) -> float:
+    """Mean square of so many normalized residuals that is no chance: correlated ones are fewer."""
+    from scipy.special import chdtri  # where fits are made: 31 MB
+
+    free = max(count / (1.0 + (count - 1.0) * held.correlation), 1.0)
+    return max(least, float(chdtri(free, 1e-5)) / free)
 
 
 # --- DOUBTED ----------------------------------------------------------------------------------

@@ -34,7 +34,6 @@ from backlash_ros.core.identification.structure_search import (
     Progress,
     StructureSearch,
     Units,
-    begun,
     later,
     observed_of,
     searched,
@@ -86,7 +85,7 @@ def identify(
         whole[part] = samples.y
         samples = replace(samples, v=v, y=whole, last=len(v))
         begin = moved_to(best.structure, best, p0=float(v[0]) + 0.5 * best.gap)
-        best = begun(fitted(samples, best.structure, begin, FIRST_STEPS, beside))
+        best = fitted(samples, best.structure, begin, FIRST_STEPS, beside)
         kept = without_outliers(samples, best)
         if kept is not samples:
             samples = kept

@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.explanations import begun_elsewhere
 from backlash_ros.core.estimation.fit import FEW_STEPS, FIRST_STEPS
 from backlash_ros.core.estimation.reading import step_of
 from backlash_ros.core.estimation.search import search
@@ -105,7 +104,7 @@ def searched(
         for _ in structures:
             chosen = selected(compared)
             models, profile = _of_gaps(samples, chosen.whole)
-            best = begun(models[0])
+            best = models[0]
             if not gives_way(best, eligible(compared)):
                 break
             # Only the best fit of all shows that a pole is none.
@@ -154,7 +153,7 @@ def _of_gaps(samples: Samples, like: Model) -> tuple[list[Model], tuple[Array, A
     y = np.where(problem.known, problem.y, nan)
     swing = float(np.ptp(problem.v))
     hypotheses, _ = search(structure, problem.v, y, 1e-12, 0.98 * swing,
-                           like.fit.theta[3:], True, SMALLEST_GAP)
+                           like.fit.theta[3:], SMALLEST_GAP)
     begins, gaps = [like.fit], [like.gap]
     for _, gap, p0, _ in hypotheses:
         if len(begins) <= most and all(abs(gap - other) > ANOTHER * other for other in gaps):
@@ -174,11 +173,6 @@ def _of_gaps(samples: Samples, like: Model) -> tuple[list[Model], tuple[Array, A
     curve = np.array(sorted(by_gap.items())).reshape(-1, 2)
     behind = curve[:, 1].max(initial=-inf) - curve[:, 1]
     return models, (curve[:, 0], np.exp(behind / min(len(problem.v), ROWS)))
-
-
-def begun(found: Model) -> Model:
-    """The model, or one whose play began elsewhere."""
-    return replace(found, fit=begun_elsewhere(found.problem, found.fit))
 
 
 def without_outliers(samples: Samples, found: Model) -> Samples:
