@@ -92,6 +92,7 @@ class AdaptiveController:
 
     def refine(self) -> None:
         """Do what the command did not have to wait for; who has no time for it leaves it out."""
+        self.structure.prepare()
         self.estimator.refine()
         if self.redesign is None:
             return

@@ -76,6 +76,9 @@ class ControlStructure:
         """Return the command of this sample; advances the inverse by one step."""
         raise NotImplementedError
 
+    def prepare(self) -> None:
+        """Do what the next command need not wait for; the next one does it where nobody asks."""
+
     def redesign(self, model: StateModel) -> Callable[[], object | None] | None:
         """What makes the gains for a better G, for `adopt`; None where there are none to make.
 

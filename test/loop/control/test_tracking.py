@@ -140,8 +140,8 @@ def test_v_comes_to_rest_after_a_motion_in_spite_of_noise(seed: int) -> None:
 def test_a_step_to_rest_stops_short_of_the_u_at_rest_by_what_is_uncertain() -> None:
     rest, inverse, estimate = resting(std=0.01)
     x = [0.0, 0.0]
-    plan = TrajectoryState(x, onward=x)
-    assert rest.decide(0.0, np.zeros(1), plan, x, 0.0, inverse.side, 0.0, False) is Mode.HOLD
+    plan = TrajectoryState(x)
+    assert rest.decide(0.0, 0.0, 0.0, plan, x, 0.0, inverse.side, 0.0, False) is Mode.HOLD
     rest.step(estimate, 0.0, 0.0, inverse, begins=True)
     # From u = 1 down to 0, where c_l = -1 may lie 0.01 higher or lower.
     assert stepped(rest, inverse, estimate) == pytest.approx(-1.0 + SHORT * 0.01)

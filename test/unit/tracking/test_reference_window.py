@@ -21,7 +21,10 @@ def test_window_and_past_are_the_last_values_in_order(preview, history, values):
     known = deque([7.0] * (preview + 1), maxlen=history + preview + 1)
     for value in values:
         known.append(value)
-        assert window.append(value).tolist() == list(known)[-preview - 1:]
+        window.append(value)
+        window.settle()
+        assert window.window.tolist() == list(known)[-preview - 1:]
+        assert [window.low, window.high] == [min(window.window), max(window.window)]
         assert window.all().tolist() == list(known)
     assert not window.empty
 
@@ -30,7 +33,12 @@ def followed(values: np.ndarray, preview: int = 60) -> np.ndarray:
     """r(k) as the trajectory takes it, of references that come one by one."""
     window = ReferenceWindow(preview, 10, np.ones(len(averages(preview))))
     window.fill(float(values[0]))
-    return np.array([window.append(value).item(0) for value in values.tolist()])[preview:]
+    taken = []
+    for value in values.tolist():
+        window.append(value)
+        window.settle()
+        taken.append(window.window.item(0))
+    return np.array(taken[preview:])
 
 
 K = np.arange(3000.0)

@@ -151,16 +151,17 @@ class StateFeedback:
                      and estimate.std_c_r + estimate.std_c_l < SHARP * large)
             trust.held_for += trust.sharp_counts if sharp else 1
 
-    def deviation(
-        self, x_hat: Sequence[float], x_cov: NDArray[np.float64] | None, x: Sequence[float],
-    ) -> list[float]:
-        """x_hat - x*; 0 while x_hat cannot be known. x_cov: of x_hat, None where it is unknown."""
+    def take_covariance(self, x_cov: NDArray[np.float64] | None) -> None:
+        """Take in that of x_hat, None where it is unknown."""
         if x_cov is not self._x_cov:
             self._x_cov = x_cov
             if x_cov is not None:
                 variances = ((self._gains @ x_cov) * self._gains).sum(axis=1)
                 self._u_std = np.sqrt(np.maximum(variances, 0.0)).tolist()
                 self.x_std = sqrt(max(float(x_cov.trace()), 0.0))
+
+    def deviation(self, x_hat: Sequence[float], x: Sequence[float]) -> list[float]:
+        """x_hat - x*; 0 while x_hat cannot be known."""
         if self.state.blind_for:
             self.state.blind_for -= 1
             return [0.0] * len(x)

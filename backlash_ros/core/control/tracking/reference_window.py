@@ -69,7 +69,8 @@ class ReferenceWindow:
     The newest N / 3 stay as they came.
 
     preview: N. history: how many references before r(k) are kept. noise_gains: standard deviation
-    of u* for noise of 1 that was averaged so, shape (widths,).
+    of u* for noise of 1 that was averaged so, shape (widths,). What `settle` has found within the
+    window: u_noise_std, largest deviation of u* by what is left of the noise; low, high.
     """
 
     def __init__(self, preview: int, history: int, noise_gains: Array) -> None:
@@ -81,6 +82,7 @@ class ReferenceWindow:
         self._rows: Array = np.zeros((3, 2 * self._kept))
         self._start = self._end = 0
         self._noise = NoiseLevel()
+        self.u_noise_std = self.low = self.high = 0.0
 
     @property
     def empty(self) -> bool:
@@ -112,8 +114,8 @@ class ReferenceWindow:
         if self._preview and abs(jump) > float(np.abs(np.diff(window)).max()):
             self._rows[:2, self._end - len(window):self._end] += np.linspace(0.0, jump, len(window))
 
-    def append(self, value: float) -> Array:
-        """Take in r(k + N) and return r(k) .. r(k + N), shape (N + 1,)."""
+    def append(self, value: float) -> None:
+        """Take in r(k + N)."""
         end = self._end
         if end == self._rows.shape[1]:
             kept = self._kept - 1
@@ -122,21 +124,20 @@ class ReferenceWindow:
         self._rows[:2, end] = value
         self._rows[2, end] = self.noise_gains[0]
         self._end = end + 1
-        self._noise.take(value)
-        half = self._parabolas.half
-        if half and self._noise.std > 0.0 and end - self._start >= 2 * half:
-            self._average(end - half)
-        return self.window
 
-    @property
-    def u_noise_std(self) -> float:
-        """Standard deviation of what is left of the noise in u*, at most within the window."""
+    def settle(self) -> None:
+        """Make of the newest reference what only the next sample needs."""
+        newest, half = self._end - 1, self._parabolas.half
+        self._noise.take(self._rows.item(0, newest))
         std = self._noise.std
-        if std == 0.0:
-            return 0.0
-        first = self._end - self._preview - 1
-        last = max(self._end - self._parabolas.half, first + 1)
-        return std * float(np.maximum.reduce(self._rows[2, first:last]))
+        if half and std > 0.0 and newest - self._start >= 2 * half:
+            self._average(newest - half)
+        window = self.window
+        self.low, self.high = float(window.min()), float(window.max())
+        if std > 0.0:
+            first = self._end - self._preview - 1
+            last = max(self._end - half, first + 1)
+            self.u_noise_std = std * float(self._rows[2, first:last].max())
 
     def _average(self, at: int) -> None:
         """Average one reference, now that as many after it are known."""

@@ -17,10 +17,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum, auto
-from math import dist, hypot
-
-import numpy as np
-from numpy.typing import NDArray
+from math import hypot
 
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.protocol import dot
@@ -28,8 +25,6 @@ from backlash_ros.core.control.tracking.design import TrackingDesign
 from backlash_ros.core.control.tracking.trajectory import TrajectoryState
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.plant.backlash import Region
-
-Array = NDArray[np.float64]
 
 # v is held as long as |x - x*| is within so many standard deviations of the noise on y (StateModel
 # scales x so that |x| is the energy of the free response of y over some 50 samples: 7 stands for
@@ -107,12 +102,12 @@ class Rest:
         self._design = design
 
     def decide(
-        self, y: float, window: Array, plan: TrajectoryState, deviation: Sequence[float],
+        self, y: float, r: float, spread: float, plan: TrajectoryState, deviation: Sequence[float],
         x_std: float | None, side: Region, pull: float, acts: bool,
     ) -> Mode:
         """Set the mode for this sample.
 
-        window: r from now on. deviation: x_hat - x*. x_std: standard deviation of x_hat, None where
+        r: the reference now. spread: of it and those to come. deviation: x_hat - x*. x_std: standard deviation of x_hat, None where
         it is unknown. side: line in use. pull: see `pull_back`. acts: whether full feedback asks
         for more than its noise.
         """
@@ -120,10 +115,10 @@ class Rest:
         state.largest = max(state.largest, hypot(*plan.x))
         least = SHARE * state.largest
         steady = STEADY * max(TOLERANCE * noise_std, least)
-        if dist(plan.x, plan.onward) > steady or float(np.ptp(window)) > noise_std:
+        if plan.moved > steady or spread > noise_std:
             state.mode, state.rested, state.returns, state.leads = Mode.FOLLOW, 0, 0, 0
         elif x_std is None:
-            off = abs(y - window.item(0)) > OFF * noise_std
+            off = abs(y - r) > OFF * noise_std
             state.mode = Mode.RETURN if off else Mode.HOLD
         else:
             state.rested += 1

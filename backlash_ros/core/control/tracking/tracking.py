@@ -8,6 +8,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 
+import numpy as np
+from numpy.typing import NDArray
+
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.protocol import Command, ControlInput, ControlStructure
 from backlash_ros.core.control.tracking.design import TrackingDesign, Weights, better_design, design
@@ -76,6 +79,8 @@ class Tracking(ControlStructure):
         self._y_noise = NoiseLevel()
         self._moves = deque([0.0], maxlen=100)  # by which v moved of late, as sizes
         self._engaged_for = 0  # samples since v has crossed the gap
+        # y, and the covariance of x_hat, of a command that the next one was not prepared after.
+        self._newest: tuple[float, NDArray[np.float64] | None] | None = None
 
     @property
     def may_change(self) -> bool:
@@ -104,6 +109,7 @@ class Tracking(ControlStructure):
         self.feedback.go_on_from(other.feedback, state_known)
         self.rest.state = replace(other.rest.state)
         self._moves, self._engaged_for = other._moves, other._engaged_for
+        self._newest = other._newest
         self.hand_over = HandOver(
             due=self.trajectory.state.u, widens=not state_known, leading=not state_known)
 
@@ -114,12 +120,13 @@ class Tracking(ControlStructure):
     def adopt(self, gains: object, source: StateSource) -> None:
         """Go on with a design as if it had been in use for as long as references are kept."""
         assert isinstance(gains, TrackingDesign)
+        self.prepare()
         self._use(gains)
         trajectory, feedback = self.trajectory, self.feedback
         trajectory.replay()
         if not trajectory.references.empty:
             state, plan = replace(feedback.state), trajectory.state
-            deviation = feedback.deviation([float(x) for x in source.x_hat], source.x_cov, plan.x)
+            deviation = feedback.deviation([float(x) for x in source.x_hat], plan.x)
             due = plan.u - feedback.u(deviation, held_back=False)
             feedback.state = state  # this was no sample
             self.hand_over = HandOver(due=due, widens=True)
@@ -136,12 +143,13 @@ class Tracking(ControlStructure):
     def control(self, inputs: ControlInput, inverse: BacklashInverse) -> Command:
         """Return u_d and v = BI(u_d)."""
         y_m, y, estimate, _, crossing = inputs
+        self.prepare()
         feedback, trust, rest, x_cov = self.feedback, self.feedback.trust, self.rest, inputs.x_cov
-        first = self.trajectory.references.empty
-        self._y_noise.take(y)
+        references = self.trajectory.references
+        first = references.empty
         self._go_on(estimate, inverse)
         plan = self._plan(y, y_m)
-        deviation = feedback.deviation(inputs.x_hat, x_cov, plan.x)
+        deviation = feedback.deviation(inputs.x_hat, plan.x)
         feedback.begin(plan.u, estimate, deviation, first)
         turned = self.trajectory.turn(
             max(self._noise_std, self._y_noise.std), inverse.direction_band, crossing)
@@ -154,7 +162,8 @@ class Tracking(ControlStructure):
         added = self.hand_over.fade()
         u_d += added
         pull, before = rest.pull_back(deviation, feedback.most), rest.state.mode
-        mode = rest.decide(y, self.trajectory.references.window, plan, deviation,
+        spread = max(references.high, y_m) - min(references.low, y_m)
+        mode = rest.decide(y, references.window.item(0), spread, plan, deviation,
                            None if x_cov is None else feedback.x_std, inverse.side, pull,
                            abs(correction) > noise)
         if mode.steps:
@@ -171,8 +180,17 @@ class Tracking(ControlStructure):
         u_d = min(max(u_d, plan.u - reach), plan.u + reach)
         v = self._invert(u_d, side, crossings, inverse)
         feedback.integrate(self._design.model.c * plan.x[0] - y, inverse.limited)
-        self.trajectory.advance()
+        self._newest = y, x_cov
         return Command(u_d, v, 0.0)
+
+    def prepare(self) -> None:
+        """Go on to the next sample, if that is still to be done."""
+        if self._newest is not None:
+            y, x_cov = self._newest
+            self._newest = None
+            self._y_noise.take(y)
+            self.feedback.take_covariance(x_cov)
+            self.trajectory.prepare()
 
     def _go_on(self, estimate: Estimate, inverse: BacklashInverse) -> None:
         """Take in the estimate, and v from whoever has made it until now."""
@@ -193,7 +211,7 @@ class Tracking(ControlStructure):
             # What may be noise is no distance to go: a loop at rest stays at rest.
             trajectory.begin(y_m if abs(y - y_m) <= OFF * self._noise_std else y)
         elif hand_over.leading:
-            trajectory.references.lead_to(y_m)
+            trajectory.lead_to(y_m)
         hand_over.leading = False
         return trajectory.take(y_m)
 

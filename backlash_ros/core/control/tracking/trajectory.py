@@ -9,12 +9,17 @@ seen before it comes. That decides on which side v is: once per turn, however no
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from math import ceil, isnan, nan
-from operator import mul
+from math import ceil, dist, isnan, nan
 
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.control.protocol import dot
 from backlash_ros.core.control.tracking.design import TrackingDesign
 from backlash_ros.core.control.tracking.reference_window import ReferenceWindow
 from backlash_ros.core.plant.backlash import Region
+
+Array = NDArray[np.float64]
 
 # u* has turned where it comes back by more than what the noise of the references does to it, in
 # standard deviations: the highest of many samples before a turn is some three above.
@@ -30,7 +35,7 @@ class TrajectoryState:
 
     x: x*, shape (n,). q: q*. side: on which u* moves, GAP until it does. extreme: the furthest u*
     in that direction, nan before there is one. decided: samples for which the side stays. ahead:
-    u* from this sample on, as far as the references are known. onward: x* of the next sample.
+    u* from this sample on, as far as the references are known. moved: by how much x* did last.
     noise_band: how far the noise of the references may turn u*. noise: of u*, what is no turn.
     """
 
@@ -40,7 +45,7 @@ class TrajectoryState:
     extreme: float = nan
     decided: int = 0
     ahead: list[float] = field(default_factory=lambda: [0.0])
-    onward: list[float] = field(default_factory=list)
+    moved: float = 0.0
     noise_band: float = 0.0
     noise: float = 0.0
 
@@ -62,7 +67,7 @@ class TrajectoryState:
 
 
 class IdealTrajectory:
-    """Follows the references, a sample at a time: `take`, `turn`, `advance`."""
+    """Follows the references, a sample at a time: `take`, `turn`, `prepare` for the next one."""
 
     def __init__(self, design: TrackingDesign) -> None:
         self.state = TrajectoryState([0.0] * design.model.order)
@@ -75,13 +80,15 @@ class IdealTrajectory:
         """Be a trajectory of this design from the next sample on."""
         self._design = design
         self.references.noise_gains = design.noise_gains
+        self._newest_gains: list[float] = design.plan_references[:, -1].tolist()
+        self._due: list[float] | None = None  # u* ahead at the next sample, but for its reference
         self._transition: list[tuple[list[float], float]] = list(
             zip(design.model.a.tolist(), design.model.b.tolist(), strict=True)
         )
 
     def go_on_from(self, other: IdealTrajectory) -> None:
         """Be where another trajectory of the same model is."""
-        self.references, self.state = other.references, replace(other.state)
+        self.references, self.state, self._due = other.references, replace(other.state), None
 
     def replay(self) -> None:
         """Be where this design would be, had it been in use as long as references are kept."""
@@ -90,18 +97,24 @@ class IdealTrajectory:
             state.x = [0.0] * self._design.model.order
             return
         state.x, state.q = self._design.replayed(references.all(), references.history)
-        self._look_ahead()
+        state.ahead = self._ahead(references.window, self._design.plan_references)
 
     def begin(self, r: float) -> None:
         """Rest at y = r."""
         self.references.fill(r)
+        self._due = None
         self.state.x = (self._design.model.equilibrium * r).tolist()
+
+    def lead_to(self, y_m: float) -> None:
+        """Let the references lead to one that is not what would have come next."""
+        self.references.lead_to(y_m)
+        self._due = None
 
     def take(self, y_m: float) -> TrajectoryState:
         """Take in r(k + N), so that u* is known for this sample and those ahead."""
-        self.references.append(y_m)
-        self.state.noise_band = TURN_BAND * self.references.u_noise_std
-        self._look_ahead()
+        due, r = self._due or self._look_ahead(), float(y_m)
+        self.references.append(r)
+        self.state.ahead = [u + gain * r for u, gain in zip(due, self._newest_gains, strict=True)]
         return self.state
 
     def turn(self, noise_std: float, band: float, crossing: float) -> bool:
@@ -138,18 +151,27 @@ class IdealTrajectory:
 
     def advance(self) -> None:
         """Go on to the next sample."""
-        state = self.state
-        state.q += self.references.window.item(0) - self._design.model.c * state.x[0]
-        state.x = state.onward
+        state, before = self.state, self.state.x
+        state.q += self.references.window.item(0) - self._design.model.c * before[0]
+        state.x = [dot(row, before) + b * state.u for row, b in self._transition]
+        state.moved = dist(state.x, before)
 
-    def _look_ahead(self) -> None:
-        design, state = self._design, self.state
-        plan = design.plan_states @ [*state.x, state.q]
-        plan += design.plan_references @ self.references.window
-        state.ahead = plan.tolist()
-        u = state.ahead[0]
-        # Without the call of `dot`: this is made at every sample.
-        state.onward = [sum(map(mul, row, state.x)) + b * u for row, b in self._transition]
+    def prepare(self) -> None:
+        """Do what the next sample needs, and its reference does not change."""
+        self.advance()
+        self.references.settle()
+        self.state.noise_band = TURN_BAND * self.references.u_noise_std
+        self._look_ahead()
+
+    def _look_ahead(self) -> list[float]:
+        self._due = self._ahead(self.references.window[1:], self._design.plan_references[:, :-1])
+        return self._due
+
+    def _ahead(self, references: Array, gains: Array) -> list[float]:
+        """u* from [x*; q*] and these references on."""
+        plan: list[float] = (
+            self._design.plan_states @ [*self.state.x, self.state.q] + gains @ references).tolist()
+        return plan
 
 
 def _turn(ahead: list[float], state: TrajectoryState, band: float, shortest: int) -> int | None:
