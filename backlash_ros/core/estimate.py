@@ -86,3 +86,8 @@ class Bounds:
             c_r = min(max(middle, self.c_r[0], self.c_l[0]), self.c_r[1])
             c_l = min(c_r, self.c_l[1])
         return m, c_r, c_l
+
+    def of_products(self, m: float, m_c_r: float, m_c_l: float) -> tuple[float, float, float]:
+        """(m, c_r, c_l) inside the bounds, from m, m c_r and m c_l."""
+        m = min(max(m, self.m[0]), self.m[1])
+        return self.project(m, m_c_r / m, m_c_l / m)

@@ -13,12 +13,13 @@ which is what the estimates may be wrong by.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from math import sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimate import Status
+from backlash_ros.core.estimate import Estimate, Status
 
 Array = NDArray[np.float64]
 
@@ -45,9 +46,9 @@ class Agreement:
         # Products judged last, the weights of their errors, and the largest sum of squares.
         self._judged, self._weights, self._most = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0
 
-    def take(self, row: Sequence[float], m: float, c_r: float, c_l: float) -> Status:
-        """Take in the three elements of phi, and t; return the status of these estimates."""
-        theta = m, m * c_r, m * c_l
+    def judged(self, new: Estimate, row: Sequence[float]) -> Estimate:
+        """The estimate with its status, after the three elements of phi, and t, of this sample."""
+        theta = new.m, new.m * new.c_r, new.m * new.c_l
         self._rows.append(row)
         if len(self._rows) == EVERY:
             self._samples += EVERY
@@ -60,7 +61,7 @@ class Agreement:
             moved = zip(theta, self._judged, self._weights, strict=True)
             if sum((weight * (now - then)) ** 2 for now, then, weight in moved) > self._most:
                 self.status = Status.ACQUIRING
-        return self.status
+        return replace(new, status=self.status)
 
     def _judge(self, theta: tuple[float, float, float]) -> Status:
         size = np.sqrt(np.diag(self._products)[:3])

@@ -24,7 +24,6 @@ Nonlinearities, Wiley 1996.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from math import nan
 
 import numpy as np
@@ -104,16 +103,11 @@ class GradientEstimator(Law):
         if norm == 0.0 or not self.adapting:
             return
         row = (*zeta.tolist(), y + returned)
-        if old.status is Status.INCONSISTENT:
-            status = self._agreement.take(row, old.m, old.c_r, old.c_l)
-            self.estimate = replace(old, status=status)
-            return
-        theta = theta + (self.step * eps / norm) * scaled
-        low, high = self._bounds.m
-        m = min(max(float(theta[0]), low), high)
-        m, c_r, c_l = self._bounds.project(m, float(theta[1]) / m, float(theta[2]) / m)
-        status = self._agreement.take(row, m, c_r, c_l)
-        self.estimate = Estimate(m, c_r, c_l, old.f, status=status)
+        new = old
+        if old.status is not Status.INCONSISTENT:
+            theta = theta + (self.step * eps / norm) * scaled
+            new = Estimate(*self._bounds.of_products(*theta.tolist()), old.f)
+        self.estimate = self._agreement.judged(new, row)
 
     def _engage(self, interval: Interval, used: Estimate) -> None:
         """Set phi for the line on which v lies; between lines the last one holds."""

@@ -7,7 +7,7 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimate import Status
+from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.law import Interval, Law
 from backlash_ros.core.laws.agreement import Agreement
 from backlash_ros.core.laws.input_reconstruction import InputReconstruction
@@ -70,9 +70,7 @@ class LaggedLaw(Law):
             return None
         return rising
 
-    def _status_of(
-        self, m: float, c_r: float, c_l: float, u: float, v: float, rising: bool,
-    ) -> Status:
-        """What this sample and those before it say of the estimates."""
+    def _take(self, new: Estimate, u: float, v: float, rising: bool) -> None:
+        """Go on with this estimate, as far as this sample and those before it agree with it."""
         row = (v, -1.0, 0.0, u) if rising else (v, 0.0, -1.0, u)
-        return self._agreement.take(row, m, c_r, c_l)
+        self.estimate = self._agreement.judged(new, row)

@@ -13,8 +13,6 @@ Reference: S. Haykin, Adaptive Filter Theory, Prentice-Hall 1996, chapter 9 (the
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from backlash_ros.core.estimate import Bounds, Estimate, Status
 from backlash_ros.core.law import Interval
 from backlash_ros.core.laws.agreement import LEAST_SQUARE
@@ -54,11 +52,13 @@ class NormalisedLms(LaggedLaw):
         rising = self._rising(u)
         if rising is None:
             return
+        if self.estimate.status is Status.INCONSISTENT:
+            self._take(self.estimate, u, past.v, rising)
+        else:
+            self._take(self._learned(u, past, rising), u, past.v, rising)
+
+    def _learned(self, u: float, past: Interval, rising: bool) -> Estimate:
         old, v = self.estimate, past.v
-        if old.status is Status.INCONSISTENT:
-            status = self._status_of(old.m, old.c_r, old.c_l, u, v, rising)
-            self.estimate = replace(old, status=status)
-            return
         m, c_r, c_l = old.m, old.c_r, old.c_l
         self._v_max = max(self._v_max, abs(v))
         e = u - m * (v - (c_r if rising else c_l))
@@ -67,12 +67,9 @@ class NormalisedLms(LaggedLaw):
         # Products first: they enter the error linearly, the crossings follow by division.
         product_r = m * c_r - gain if rising else m * c_r
         product_l = m * c_l if rising else m * c_l - gain
-        low, high = self._bounds.m
-        m = min(max(m + gain * weight * v, low), high)
-        m, c_r, c_l = self._bounds.project(m, product_r / m, product_l / m)
+        m, c_r, c_l = self._bounds.of_products(m + gain * weight * v, product_r, product_l)
         f = old.f
         if self.step_f > 0.0:
             f += self.step_f * (u - past.u_d) * v / (1.0 + v * v)
             f = min(max(f, self._f_bounds[0]), self._f_bounds[1])
-        status = self._status_of(m, c_r, c_l, u, v, rising)
-        self.estimate = Estimate(m, c_r, c_l, f, status=status)
+        return Estimate(m, c_r, c_l, f)

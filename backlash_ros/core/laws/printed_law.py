@@ -73,10 +73,9 @@ class PrintedLaw(LaggedLaw):
         c = printed_c(u, past.y_m, f, m)
         c_r = self._guarded(c, old.c_r, self._bounds.c_r) if upward else old.c_r
         c_l = old.c_l if upward else self._guarded(c, old.c_l, self._bounds.c_l)
-        status, rising = old.status, self._rising(u)
+        self.estimate, rising = Estimate(m, c_r, c_l, f, status=old.status), self._rising(u)
         if rising is not None:
-            status = self._status_of(m, c_r, c_l, u, past.v, rising)
-        self.estimate = Estimate(m, c_r, c_l, f, status=status)
+            self._take(self.estimate, u, past.v, rising)
 
     def _guarded(self, value: float, old: float, bounds: tuple[float, float]) -> float:
         if not isfinite(value):

@@ -34,18 +34,6 @@ def control_error_rms(run: RunRecord) -> float | None:
     return float(np.sqrt(np.mean(e**2))) if e.size else None
 
 
-def tracking_error_rms(run: RunRecord) -> float | None:
-    """RMS of y - y_m over RMS of y_m in the last half; None for a reference at zero."""
-    if run.samples == 0:
-        return None
-    half = run.samples // 2
-    y_m = run.column('y_m')[half:]
-    size = float(np.sqrt(np.mean(y_m**2)))
-    if size == 0.0:
-        return None
-    return float(np.sqrt(np.mean((run.column('y')[half:] - y_m) ** 2))) / size
-
-
 def delayed_reference(run: RunRecord, delay: int) -> NDArray[np.float64]:
     """y_m as it is to be followed: `delay` samples late, and y(0) before, shape (N,).
 
@@ -58,18 +46,16 @@ def delayed_reference(run: RunRecord, delay: int) -> NDArray[np.float64]:
     return np.where(newest >= 0, y_m[np.maximum(newest, 0)], run.column('y')[:1])
 
 
-def delayed_tracking_error_rms(
-    run: RunRecord, delay: int, since: float = 0.0, y: NDArray[np.float64] | None = None,
-) -> float | None:
+def delayed_tracking_error_rms(run: RunRecord, delay: int, since: float = 0.0) -> float | None:
     """RMS of y - y_m(k - delay) over RMS of y_m(k - delay) from time `since` [s] on.
 
-    y: output to judge instead of the measured one, shape (N,). None for a reference at zero.
+    None for a reference at zero.
     """
     rows = run.column('t') >= since
     reference = delayed_reference(run, delay)[rows]
     if reference.size == 0 or not np.any(reference):
         return None
-    error = (run.column('y') if y is None else y)[rows] - reference
+    error = run.column('y')[rows] - reference
     return float(np.sqrt(np.mean(error**2) / np.mean(reference**2)))
 
 

@@ -7,8 +7,8 @@ import pytest
 
 from backlash_ros.core.simulation.metrics import (
     control_error_rms,
+    delayed_tracking_error_rms,
     settling_time,
-    tracking_error_rms,
 )
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 
@@ -34,7 +34,7 @@ def test_settling_time_of_an_exponential_is_when_it_reaches_one_percent() -> Non
 def test_tracking_error_is_relative_and_taken_over_the_last_half() -> None:
     y_m = 10.0 * np.sin(12.6 * T)
     y = np.where(T < 5.0, 99.0, 1.03 * y_m)
-    assert tracking_error_rms(run(y=y, y_m=y_m)) == pytest.approx(0.03)
+    assert delayed_tracking_error_rms(run(y=y, y_m=y_m), 0, 5.0) == pytest.approx(0.03)
 
 
 def test_run_without_samples_has_no_figures() -> None:
@@ -42,7 +42,7 @@ def test_run_without_samples_has_no_figures() -> None:
     assert nothing.samples == 0
     assert not nothing.has_truth
     assert control_error_rms(nothing) is None
-    assert tracking_error_rms(nothing) is None
+    assert delayed_tracking_error_rms(nothing, 0) is None
     assert settling_time(T[:0], ONES[:0], ONES[:0]) is None
 
 
