@@ -6,9 +6,6 @@ from collections.abc import Callable, Sequence
 from operator import mul
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.law import StateSource
@@ -31,17 +28,6 @@ class ControlInput(NamedTuple):
     estimate: Estimate
     source: StateSource
     crossing: float = 0.0
-
-    @property
-    def x_hat(self) -> Sequence[float]:
-        """State of G in the coordinates of StateModel, shape (n,)."""
-        x_hat = self.source.x_hat
-        return x_hat.tolist() if isinstance(x_hat, np.ndarray) else x_hat
-
-    @property
-    def x_cov(self) -> NDArray[np.float64] | None:
-        """Covariance of x_hat, shape (n, n); None where there is none."""
-        return self.source.x_cov
 
 
 class Command(NamedTuple):

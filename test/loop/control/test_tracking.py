@@ -59,7 +59,8 @@ def error(p: Parameters, samples: int = 500) -> float:
 def test_learned_backlash_costs_nothing(amplitude: float) -> None:
     p = tracking(amplitude=amplitude)
     ideal = error(p.replaced({**GAPLESS, **NO_GAP}))
-    assert error(p) <= 1.02 * ideal
+    # What may be noise is left alone.
+    assert error(p) <= 1.02 * ideal + 0.3 * p.estimator.output_noise_std / amplitude
 
 
 @pytest.mark.parametrize('preview', [20, 60])
@@ -141,14 +142,14 @@ def test_a_step_to_rest_stops_short_of_the_u_at_rest_by_what_is_uncertain() -> N
     rest, inverse, estimate = resting(std=0.01)
     x = [0.0, 0.0]
     plan = TrajectoryState(x)
-    assert rest.decide(0.0, 0.0, 0.0, plan, x, 0.0, inverse.side, 0.0, False) is Mode.HOLD
-    rest.step(estimate, 0.0, 0.0, inverse, begins=True)
+    assert rest.decide(0.0, 1e-3, 0.0, 0.0, plan, x, 0.0, inverse.side, 0.0, False) is Mode.HOLD
+    rest.step(estimate, 0.0, 0.0, 0.0, inverse, begins=True)
     # From u = 1 down to 0, where c_l = -1 may lie 0.01 higher or lower.
     assert stepped(rest, inverse, estimate) == pytest.approx(-1.0 + SHORT * 0.01)
-    rest.step(estimate, 0.0, 0.0, inverse, begins=False)
+    rest.step(estimate, 0.0, 0.0, 0.0, inverse, begins=False)
     assert not inverse.taking_up, 'nothing more is known, so nothing more is done'
     known = resting(std=0.001)[2]
-    rest.step(known, 0.0, 0.0, inverse, begins=False)
+    rest.step(known, 0.0, 0.0, 0.0, inverse, begins=False)
     assert stepped(rest, inverse, known) == pytest.approx(-1.0 + SHORT * 0.001)
 
 
@@ -163,7 +164,7 @@ def resting(std: float) -> tuple[Rest, BacklashInverse, Estimate]:
     inverse = BacklashInverse()
     inverse.step(1.0, 1.0, 1.0, -1.0)
     estimate = Estimate(1.0, 1.0, -1.0, 0.0, std, std, std, Status.TRACKING)
-    return Rest(design(model, Weights(1e-2, 0.0, 10)), 1e-3), inverse, estimate
+    return Rest(design(model, Weights(1e-2, 0.0, 10))), inverse, estimate
 
 
 @pytest.mark.parametrize('seed', [14, 319])

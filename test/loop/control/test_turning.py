@@ -55,8 +55,9 @@ def test_noise_of_the_reference_does_not_make_v_cross_the_gap(noise: float, band
 def test_noise_of_y_larger_than_configured_does_not_make_v_cross_the_gap(noise, rests_from):
     asked = 0.5 * np.sin(1.5 * np.minimum(np.arange(0.0, 12.0, PERIOD), rests_from))
     v, error = moved(asked, output_noise_std=noise, fixed__doubt=0.1)
-    assert turns(v, 0.5 * GAP) <= turns(asked, 0.1) + 3
-    assert error < 0.25 * noise
+    # u* itself turns a few times where the motion begins and ends.
+    assert turns(v, 0.5 * GAP) <= turns(asked, 0.1) + 5
+    assert error < 0.15 * noise
 
 
 def moves_with_rests(seed: int, count: int, rest: int) -> Array:

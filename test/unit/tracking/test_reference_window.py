@@ -10,6 +10,12 @@ from hypothesis import strategies as st
 from backlash_ros.core.control.tracking.reference_window import ReferenceWindow, averages
 
 
+def taken(window: ReferenceWindow, value: float) -> np.ndarray:
+    window.append(value)
+    window.settle()
+    return window.window
+
+
 @given(
     preview=st.integers(0, 5), history=st.integers(0, 7),
     values=st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=80),
@@ -21,9 +27,7 @@ def test_window_and_past_are_the_last_values_in_order(preview, history, values):
     known = deque([7.0] * (preview + 1), maxlen=history + preview + 1)
     for value in values:
         known.append(value)
-        window.append(value)
-        window.settle()
-        assert window.window.tolist() == list(known)[-preview - 1:]
+        assert taken(window, value).tolist() == list(known)[-preview - 1:]
         assert [window.low, window.high] == [min(window.window), max(window.window)]
         assert window.all().tolist() == list(known)
     assert not window.empty
@@ -33,12 +37,7 @@ def followed(values: np.ndarray, preview: int = 60) -> np.ndarray:
     """r(k) as the trajectory takes it, of references that come one by one."""
     window = ReferenceWindow(preview, 10, np.ones(len(averages(preview))))
     window.fill(float(values[0]))
-    taken = []
-    for value in values.tolist():
-        window.append(value)
-        window.settle()
-        taken.append(window.window.item(0))
-    return np.array(taken[preview:])
+    return np.array([taken(window, value).item(0) for value in values.tolist()])[preview:]
 
 
 K = np.arange(3000.0)

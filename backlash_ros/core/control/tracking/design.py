@@ -19,8 +19,8 @@ Gain = list[float]
 
 # Times the input weight of feedback: the softer gains are for noise, and up to SOFTEST for the time
 # while v meets its limits or the estimate is new; that one while the backlash is unknown.
-SCHEDULE: tuple[float, ...] = tuple((10.0 ** (0.5 * np.arange(13))).tolist())
-SOFTEST = 8
+SCHEDULE = (1.0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6)
+SOFTEST = 4
 # Times the input weight with which feedback around a better G is tried in turn, until its loop is
 # as safe as the one it replaces. The trajectory keeps the weight that was asked for.
 SAFER = (1.0, *np.geomspace(1.1, 100.0, 60).tolist())

@@ -1,31 +1,32 @@
 """Feedback that holds x on the ideal trajectory: K (x_hat - x*) + K_q (q - q*), within bounds.
 
-It is as hard as the estimate of the backlash is trusted. The first estimate may be confidently
-wrong, which the samples after it contradict; so feedback hardens step by step as it holds, and
-softens while v does not follow.
+A deviation that noise explains is left alone: to feed it back would make v cross the gap for
+nothing. What is beyond is fed back as hard as the estimate of the backlash is trusted. The first
+one may be confidently wrong, which the samples after it contradict; so feedback hardens step by
+step as it holds, and softens while v does not follow.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import hypot, isnan, nan, sqrt
-from operator import sub
+from math import hypot, inf, isnan, nan, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.control.protocol import LARGEST_FEEDBACK, LARGEST_IN_ACQUISITION, dot
 from backlash_ros.core.control.tracking.design import SOFTEST, Gain, TrackingDesign
-from backlash_ros.core.control.tracking.rest import TOLERANCE
+from backlash_ros.core.control.tracking.rest import ARRIVED, ASTRAY, CLOSE, TOLERANCE, UNCERTAIN
 from backlash_ros.core.estimate import Estimate, Status
+
+Array = NDArray[np.float64]
 
 TRUSTED_AFTER = 40  # samples for which an estimate has to hold before it gets full feedback
 # An estimate this sharp, in relative deviations of slope and gap, counts so many times per sample.
 SHARP, SHARP_COUNTS = 0.01, 17
 # Feedback is as hard as leaves the standard deviation of what it makes of noise below this share of
-# the u that the gap takes, or of what it asks for. The band around noise within which v does not
-# turn lets a hard loop cycle, and often; a softer one makes less of the same noise.
+# the u that the gap takes.
 NOISE_SHARE = 0.1
 
 
@@ -86,18 +87,19 @@ class StateFeedback:
         self.trust, self.state = Trust(), FeedbackState()
         self._shrinkage, self._noise_std = shrinkage, noise_std
         self._newest: Estimate | None = None
-        self._scale = 0.0  # largest |u*| so far, or the u that the gap takes
+        # The u that the gap takes, and that or the largest |u*| so far.
+        self._gap_u = self._scale = 0.0
         self.use(design)
 
     def use(self, design: TrackingDesign) -> None:
         """Use these gains."""
         self._design = design
-        self._x_cov: NDArray[np.float64] | None = None
+        self._x_cov: Array | None = None
         # Of every gain: as a matrix, its size, and the deviation of K x_hat.
         self._gains = np.array(design.schedule)
         self._sizes = [hypot(*gain) for gain in design.schedule]
         self._u_std, self._quiet = [0.0] * len(self._sizes), 0
-        self.x_std = 0.0  # deviation of x_hat
+        self.x_std = self._ignored = 0.0  # deviation of x_hat, |x_hat - x*| that is left alone
 
     def go_on_from(self, other: StateFeedback, state_known: bool) -> None:
         """Go on where another one is; from the softest, where x_hat begins anew and full of noise.
@@ -105,6 +107,8 @@ class StateFeedback:
         state_known: whether it does not.
         """
         self.trust, self.state = replace(other.trust), replace(other.state)
+        self._gap_u = other._gap_u
+        self.prepare(other._x_cov, self._noise_std)
         if not state_known:
             self.trust = Trust(sharp_counts=1)
             self.state = replace(self.state, width=1.0, asked=0.0, bounded=False,
@@ -126,17 +130,14 @@ class StateFeedback:
             trust.slope = estimate.m
         return True
 
-    def begin(
-        self, ideal: float, estimate: Estimate, deviation: Sequence[float], first: bool,
-    ) -> None:
+    def begin(self, ideal: float, estimate: Estimate, first: bool) -> None:
         """Note u* of this sample, the scale of what is allowed, and count it for the estimate.
 
         first: of this loop; an estimate was known before then.
         """
         trust, gap = self.trust, estimate.c_r - estimate.c_l
-        self.state.asked = max(self.state.asked, abs(ideal))
-        self._scale = max(self.state.asked, estimate.m * gap)
-        self._quiet = self._hardest(estimate.m * gap, deviation)
+        self.state.asked, self._gap_u = max(self.state.asked, abs(ideal)), estimate.m * gap
+        self._scale = max(self.state.asked, self._gap_u)
         if not (trust.known and estimate.learned):
             # Without deviations nobody knows how far it may be relied on.
             trust.held_for = trust.in_use_for = 0
@@ -151,21 +152,25 @@ class StateFeedback:
                      and estimate.std_c_r + estimate.std_c_l < SHARP * large)
             trust.held_for += trust.sharp_counts if sharp else 1
 
-    def take_covariance(self, x_cov: NDArray[np.float64] | None) -> None:
-        """Take in that of x_hat, None where it is unknown."""
+    def prepare(self, x_cov: Array | None, noise_std: float) -> None:
+        """Take in the covariance of x_hat, None where it is unknown, and the noise of y."""
         if x_cov is not self._x_cov:
             self._x_cov = x_cov
             if x_cov is not None:
                 variances = ((self._gains @ x_cov) * self._gains).sum(axis=1)
                 self._u_std = np.sqrt(np.maximum(variances, 0.0)).tolist()
                 self.x_std = sqrt(max(float(x_cov.trace()), 0.0))
+        # By as much v may rest off: one rule for motion and rest.
+        self._ignored = ARRIVED * max(CLOSE * noise_std, UNCERTAIN * self.x_std)
+        last, most = len(self._sizes) - 1, NOISE_SHARE * self._gap_u or inf
+        self._quiet = next((i for i in range(last) if self._noise_of(i) <= most), last)
 
-    def deviation(self, x_hat: Sequence[float], x: Sequence[float]) -> list[float]:
+    def deviation(self, x_hat: Sequence[float] | Array, x: Sequence[float]) -> list[float]:
         """x_hat - x*; 0 while x_hat cannot be known."""
         if self.state.blind_for:
             self.state.blind_for -= 1
             return [0.0] * len(x)
-        return list(map(sub, x_hat, x))
+        return [float(x_hat[i]) - each for i, each in enumerate(x)]
 
     def u(self, deviation: Sequence[float], held_back: bool) -> float:
         """What is taken from u*.
@@ -175,7 +180,11 @@ class StateFeedback:
         widening = 1.03  # per sample, of the bound on feedback while the backlash is unknown
         state, most = self.state, self.most
         if self.trust.begun:
-            feedback = dot(self._gain(held_back or state.bounded), deviation)
+            off = hypot(*deviation)
+            gain = self._gain(held_back or state.bounded, off > ASTRAY / ARRIVED * self._ignored)
+            feedback = dot(gain, deviation)
+            if self.trust.full and self._x_cov is not None:
+                feedback *= 1.0 - self._ignored / max(off, self._ignored)
         else:
             feedback = dot(self._design.acquisition or (), deviation)
             if not -most < feedback < most:
@@ -202,20 +211,8 @@ class StateFeedback:
         return self._noise_of(self._quiet)
 
     def _noise_of(self, level: int) -> float:
-        """With a gain of the schedule: by the covariance of x_hat, and at least for errors of y of
-        half its noise.
-        """
+        """By the covariance of x_hat, and at least for errors of y of half its noise."""
         return max(self._u_std[level], 0.5 * self._noise_std * self._sizes[level])
-
-    def _hardest(self, gap_u: float, deviation: Sequence[float]) -> int:
-        """Level of the hardest gain that noise allows. gap_u: u that the gap takes."""
-        if not gap_u or self._noise_of(0) <= NOISE_SHARE * gap_u:
-            return 0
-        last = len(self._sizes) - 1
-        for i, asked in enumerate((self._gains[:last] @ np.array(deviation)).tolist()):
-            if self._noise_of(i) <= NOISE_SHARE * max(gap_u, abs(asked)):
-                return i
-        return last
 
     @property
     def most(self) -> float:
@@ -227,29 +224,28 @@ class StateFeedback:
         """
         if not self.trust.begun:
             return self.state.width * self._scale
-        return LARGEST_FEEDBACK * max(self._scale, TOLERANCE * self._noise_std * self._size)
+        # |K|: what full feedback makes of an error of y.
+        return LARGEST_FEEDBACK * max(self._scale, TOLERANCE * self._noise_std * self._sizes[0])
 
     @property
     def reach(self) -> float:
         """Largest |u_d - u*|, whatever makes u_d."""
         return self.most if self.trust.begun else LARGEST_IN_ACQUISITION * self._scale
 
-    @property
-    def _size(self) -> float:
-        """|K|: what full feedback makes of an error of y."""
-        return self._sizes[0]
+    def _gain(self, held_back: bool, astray: bool) -> Gain:
+        """K, or the less of it the longer v does not follow, and the newer the estimate.
 
-    def _gain(self, held_back: bool) -> Gain:
-        """K, or the less of it the longer v does not follow, and the newer the estimate."""
+        astray: whether y is so far away that it does not matter what noise makes v do.
+        """
         stiffen_after = 20  # samples without a limit after which feedback takes a step back to full
         state, schedule = self.state, self._design.schedule
         state.free = 0 if held_back else state.free + 1
         if held_back:
-            state.level = min(state.level + 2, SOFTEST)
+            state.level = min(state.level + 1, SOFTEST)
         elif state.level > 0 and state.free % stiffen_after == 0:
-            state.level -= 2
-        unproven = 2 * (SOFTEST // 2 - self.trust.held_for * (SOFTEST // 2 + 1) // TRUSTED_AFTER)
-        return schedule[max(state.level, unproven, self._quiet)]
+            state.level -= 1
+        unproven = SOFTEST - self.trust.held_for * (SOFTEST + 1) // TRUSTED_AFTER
+        return schedule[max(state.level, unproven, 0 if astray else self._quiet)]
 
 
 def shrunk_crossings(estimate: Estimate, deviations: float, known: bool) -> tuple[float, float]:

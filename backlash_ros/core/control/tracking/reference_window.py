@@ -70,7 +70,8 @@ class ReferenceWindow:
 
     preview: N. history: how many references before r(k) are kept. noise_gains: standard deviation
     of u* for noise of 1 that was averaged so, shape (widths,). What `settle` has found within the
-    window: u_noise_std, largest deviation of u* by what is left of the noise; low, high.
+    window: low, high; noise_spread, by how much noise parts them at most; u_noise_std, largest
+    deviation of u* by what is left of the noise.
     """
 
     def __init__(self, preview: int, history: int, noise_gains: Array) -> None:
@@ -82,7 +83,7 @@ class ReferenceWindow:
         self._rows: Array = np.zeros((3, 2 * self._kept))
         self._start = self._end = 0
         self._noise = NoiseLevel()
-        self.u_noise_std = self.low = self.high = 0.0
+        self.u_noise_std = self.noise_spread = self.low = self.high = 0.0
 
     @property
     def empty(self) -> bool:
@@ -135,6 +136,7 @@ class ReferenceWindow:
         window = self.window
         self.low, self.high = float(window.min()), float(window.max())
         if std > 0.0:
+            self.noise_spread = 8.0 * std
             first = self._end - self._preview - 1
             last = max(self._end - half, first + 1)
             self.u_noise_std = std * float(self._rows[2, first:last].max())

@@ -69,10 +69,9 @@ class RestState:
 
     u_d: where v rests. shrinkage: standard deviations by which the crossings are shrunk for it.
     largest: |x*| so far. limit: tolerance in use. rested: samples for which the trajectory has.
-    returns, leads:
-    how often y was brought back since, by full feedback and gently. turns, side: of v in this
-    return, and the newest line. near: samples since y was last away. pull: u - u* with which
-    leading back began.
+    returns, leads: how often y was brought back since, by full feedback and gently. turns, side: of
+    v in this return, and the newest line. near: samples since y was last away. pull: u - u* with
+    which leading back began.
     """
 
     mode: Mode = Mode.HOLD
@@ -90,11 +89,10 @@ class RestState:
 
 
 class Rest:
-    """Decides whether v rests, and steps it there. noise_std: of y."""
+    """Decides whether v rests, and steps it there."""
 
-    def __init__(self, design: TrackingDesign, noise_std: float) -> None:
+    def __init__(self, design: TrackingDesign) -> None:
         self.state = RestState()
-        self._noise_std = noise_std
         self.use(design)
 
     def use(self, design: TrackingDesign) -> None:
@@ -102,20 +100,20 @@ class Rest:
         self._design = design
 
     def decide(
-        self, y: float, r: float, spread: float, plan: TrajectoryState, deviation: Sequence[float],
-        x_std: float | None, side: Region, pull: float, acts: bool,
+        self, y: float, noise_std: float, r: float, spread: float, plan: TrajectoryState,
+        deviation: Sequence[float], x_std: float | None, side: Region, pull: float, acts: bool,
     ) -> Mode:
         """Set the mode for this sample.
 
-        r: the reference now. spread: of it and those to come. deviation: x_hat - x*. x_std: standard deviation of x_hat, None where
-        it is unknown. side: line in use. pull: see `pull_back`. acts: whether full feedback asks
-        for more than its noise.
+        noise_std: of y. r: the reference now. spread: of it and those to come, beyond their noise.
+        deviation: x_hat - x*. x_std: standard deviation of x_hat, None where it is unknown. side:
+        line in use. pull: see `pull_back`. acts: whether feedback asks for more than its noise.
         """
-        state, noise_std = self.state, self._noise_std
+        state = self.state
         state.largest = max(state.largest, hypot(*plan.x))
         least = SHARE * state.largest
         steady = STEADY * max(TOLERANCE * noise_std, least)
-        if plan.moved > steady or spread > noise_std:
+        if spread > noise_std or (state.mode is Mode.FOLLOW and plan.moved > steady):
             state.mode, state.rested, state.returns, state.leads = Mode.FOLLOW, 0, 0, 0
         elif x_std is None:
             off = abs(y - r) > OFF * noise_std
@@ -166,11 +164,12 @@ class Rest:
         self.state.u_d, self.state.shrinkage = inverse.extreme, 0.0
 
     def step(
-        self, estimate: Estimate, ideal: float, pull: float, inverse: BacklashInverse, begins: bool,
+        self, estimate: Estimate, ideal: float, noise: float, pull: float,
+        inverse: BacklashInverse, begins: bool,
     ) -> None:
         """Say where v is to rest, where that is better than to stay.
 
-        ideal: u*. begins: whether the mode has changed with this sample.
+        ideal: u*, with so much noise. begins: whether the mode has changed with this sample.
         """
         state = self.state
         if begins:
@@ -185,7 +184,7 @@ class Rest:
             return
         side_std = estimate.std_c_r if ideal > u else estimate.std_c_l
         away, uncertain = abs(ideal - u), SHORT * side_std * estimate.m
-        if away * self._design.push > MATTERS * state.limit and away > GAIN * uncertain:
+        if away * self._design.push > MATTERS * state.limit and away > max(GAIN * uncertain, noise):
             self._aim(ideal, u, SHORT, inverse)
 
     def _aim(self, u_d: float, u: float, shrinkage: float, inverse: BacklashInverse) -> None:

@@ -27,7 +27,6 @@ from backlash_ros.core.plant.transfer_function import StateModel
 # has crossed the gap with it; samples after a crossing, by then its last moves are over.
 SETTLED_AFTER, ENGAGED_AFTER = 150, 5
 FORESEEN = 6  # samples in which u* is neither to turn nor to hurry when another design takes over
-BEYOND = 0.3  # deviations of noise in feedback, that u_d may go further onward than u* soon is
 IN_FEEDBACK = 4.0  # times the noise of u* that feedback makes of the same noise
 NOISE_BAND = 4.0  # deviations of the noise in feedback that are worth a crossing of the gap
 FADING = 0.8  # per sample, of what is handed over
@@ -71,12 +70,12 @@ class Tracking(ControlStructure):
         self, beginning: TrackingDesign, weights: Weights, shrinkage: float, noise_std: float = 0.0,
     ) -> None:
         self.delay = weights.preview
-        self._weights, self._noise_std, self._design = weights, noise_std, beginning
+        self._weights, self._told_noise, self._design = weights, noise_std, beginning
         self.trajectory = IdealTrajectory(beginning)
         self.feedback = StateFeedback(beginning, shrinkage, noise_std)
-        self.rest = Rest(beginning, noise_std)
+        self.rest = Rest(beginning)
         self.hand_over = HandOver()
-        self._y_noise = NoiseLevel()
+        self._y_noise, self._noise_std = NoiseLevel(), noise_std  # as measured, where that is more
         self._moves = deque([0.0], maxlen=100)  # by which v moved of late, as sizes
         self._engaged_for = 0  # samples since v has crossed the gap
         # y, and the covariance of x_hat, of a command that the next one was not prepared after.
@@ -122,11 +121,12 @@ class Tracking(ControlStructure):
         assert isinstance(gains, TrackingDesign)
         self.prepare()
         self._use(gains)
+        self.feedback.prepare(source.x_cov, self._noise_std)
         trajectory, feedback = self.trajectory, self.feedback
         trajectory.replay()
         if not trajectory.references.empty:
             state, plan = replace(feedback.state), trajectory.state
-            deviation = feedback.deviation([float(x) for x in source.x_hat], plan.x)
+            deviation = feedback.deviation(source.x_hat, plan.x)
             due = plan.u - feedback.u(deviation, held_back=False)
             feedback.state = state  # this was no sample
             self.hand_over = HandOver(due=due, widens=True)
@@ -142,33 +142,32 @@ class Tracking(ControlStructure):
 
     def control(self, inputs: ControlInput, inverse: BacklashInverse) -> Command:
         """Return u_d and v = BI(u_d)."""
-        y_m, y, estimate, _, crossing = inputs
+        y_m, y, estimate, source, crossing = inputs
         self.prepare()
-        feedback, trust, rest, x_cov = self.feedback, self.feedback.trust, self.rest, inputs.x_cov
+        feedback, trust, rest, x_cov = self.feedback, self.feedback.trust, self.rest, source.x_cov
         references = self.trajectory.references
         first = references.empty
         self._go_on(estimate, inverse)
         plan = self._plan(y, y_m)
-        deviation = feedback.deviation(inputs.x_hat, plan.x)
-        feedback.begin(plan.u, estimate, deviation, first)
+        deviation = feedback.deviation(source.x_hat, plan.x)
+        feedback.begin(plan.u, estimate, first)
         turned = self.trajectory.turn(
-            max(self._noise_std, self._y_noise.std), inverse.direction_band, crossing)
+            self._noise_std, estimate.m * (estimate.c_r - estimate.c_l), inverse.direction_band,
+            crossing)
         correction = feedback.u(deviation, inverse.limited or inverse.taking_up)
         u_d = plan.u - correction
         # What the noise of the references makes of u* and is not followed shows as a deviation.
         noise = NOISE_BAND * feedback.noise + IN_FEEDBACK * plan.noise_band
-        if trust.full and abs(correction) < noise:
-            u_d = plan.bounded(u_d, BEYOND * feedback.noise)
         added = self.hand_over.fade()
         u_d += added
         pull, before = rest.pull_back(deviation, feedback.most), rest.state.mode
-        spread = max(references.high, y_m) - min(references.low, y_m)
-        mode = rest.decide(y, references.window.item(0), spread, plan, deviation,
+        spread = max(references.high, y_m) - min(references.low, y_m) - references.noise_spread
+        mode = rest.decide(y, self._noise_std, references.window.item(0), spread, plan, deviation,
                            None if x_cov is None else feedback.x_std, inverse.side, pull,
                            abs(correction) > noise)
         if mode.steps:
             if x_cov is not None:
-                rest.step(estimate, plan.u, pull, inverse, mode is not before)
+                rest.step(estimate, plan.u, plan.noise_band, pull, inverse, mode is not before)
             elif not before.steps:
                 rest.stay(inverse)
             side, u_d = None, rest.state.u_d
@@ -189,7 +188,8 @@ class Tracking(ControlStructure):
             y, x_cov = self._newest
             self._newest = None
             self._y_noise.take(y)
-            self.feedback.take_covariance(x_cov)
+            self._noise_std = max(self._told_noise, self._y_noise.std)
+            self.feedback.prepare(x_cov, self._noise_std)
             self.trajectory.prepare()
 
     def _go_on(self, estimate: Estimate, inverse: BacklashInverse) -> None:

@@ -24,9 +24,9 @@ Array = NDArray[np.float64]
 # u* has turned where it comes back by more than what the noise of the references does to it, in
 # standard deviations: the highest of many samples before a turn is some three above.
 TURN_BAND = 6.0
-# Nor is it a turn that is so small a share of what u* does within sight: LQ preview rings before a
-# motion.
-SMALLEST_TURN = 0.02
+# Nor is it a turn that would move y by less than its noise, unless it is this share of the u that
+# the gap takes.
+SMALLEST_TURN = 0.01
 
 
 @dataclass
@@ -58,12 +58,6 @@ class TrajectoryState:
     def back(self) -> float:
         """By how much u* has come back without having turned."""
         return max((self.extreme - self.ahead[0]) * self.side, 0.0)
-
-    def bounded(self, u_d: float, beyond: float) -> float:
-        """u_d not much further onward than u* soon is: there is no way back but across the gap."""
-        if self.side is Region.RIGHT:
-            return min(u_d, max(self.ahead) + beyond)
-        return max(u_d, min(self.ahead) - beyond) if self.side is Region.LEFT else u_d
 
 
 class IdealTrajectory:
@@ -117,21 +111,20 @@ class IdealTrajectory:
         self.state.ahead = [u + gain * r for u, gain in zip(due, self._newest_gains, strict=True)]
         return self.state
 
-    def turn(self, noise_std: float, band: float, crossing: float) -> bool:
+    def turn(self, noise_std: float, gap_u: float, band: float, crossing: float) -> bool:
         """Decide on which side v is to be at this sample; returns whether it is another one.
 
-        noise_std: of y; a turn that would move y by no more, if it lasted, is none. band: of u*; a
-        turn by less is one only if it lasts for as long as the references are known. crossing:
-        samples that v takes across the gap; it leaves for the other side as much before the turn
-        as it arrives after it.
+        noise_std: of y. gap_u: u that the gap takes. band: of u*; a turn by less is one only if it
+        lasts for as long as the references are known. crossing: samples that v takes across the
+        gap; it leaves for the other side as much before the turn as it arrives after it.
         """
         state, ahead = self.state, self.state.ahead
         if isnan(state.extreme):
             state.extreme = ahead[0]
         before, taken = state.side, ceil(crossing)
         arrival = max(taken - 1, 0)
-        least = noise_std / self._design.push_ahead
-        state.noise = max(least, state.noise_band, SMALLEST_TURN * (max(ahead) - min(ahead)))
+        least = min(noise_std / self._design.push_ahead, SMALLEST_TURN * gap_u)
+        state.noise = max(least, state.noise_band)
         if state.decided > 0:
             state.decided -= 1
         elif state.side is Region.GAP:
