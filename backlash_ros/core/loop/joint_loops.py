@@ -66,6 +66,8 @@ class JointLoops:
                 steps[joint] = step
         self._send_waiting()
         self.counter.sender.learn()
+        for joint in steps:
+            self.by_name[joint].core.structure.prepare()
         return steps
 
     def take_references(self, y_m: Mapping[str, float]) -> None:
