@@ -57,7 +57,7 @@ def test_backlash_and_noise_are_found(seed: int) -> None:
 
 @pytest.mark.parametrize('delay', [0, 2, 5])
 def test_delay_of_v_is_found_by_evidence(delay: int) -> None:
-    fit = of(*record(500, delay=delay), delays=range(8))
+    fit = of(*record(500, delay=delay), 0.0, delays=range(8))
     assert fit.delay == delay
     assert fit.margins[delay] == 0.0
     assert min(margin for other, margin in fit.margins.items() if other != delay) > 3.0
