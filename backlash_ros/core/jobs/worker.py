@@ -17,8 +17,10 @@ import sys
 import traceback
 from collections import deque
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib import import_module
+from pathlib import Path
 from queue import SimpleQueue
 from struct import Struct
 from threading import Event, Thread
@@ -31,8 +33,6 @@ LENGTH = Struct('<Q')  # of an answer, in bytes, before it
 # Wait before a worker is replaced [s] that died without an answer, as the one before it did: the
 # first, and the longest, by doubling.
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.1, 10.0
-_APART: dict[str, Any] = {'process_group': 0} if sys.version_info >= (3, 11) \
-    else {'start_new_session': True}
 
 
 @dataclass
@@ -199,8 +199,9 @@ def _start(preload: tuple[str, ...]) -> subprocess.Popen[bytes]:
         f'from {__name__} import serve; serve({preload!r})'
     process = subprocess.Popen(
         [sys.executable, '-c', code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0,
-        # So it gets no Ctrl-C, not even while it starts. Between sessions niceness would not count.
-        **_APART,
+        # In a session of its own it gets no Ctrl-C, not even while it starts, and what it takes of
+        # a processor is not taken from the share of the loop.
+        start_new_session=True,
         # A second thread of a fit would take the core on which the loop runs.
         env={**os.environ, 'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'},
     )
@@ -211,6 +212,8 @@ def _start(preload: tuple[str, ...]) -> subprocess.Popen[bytes]:
     os.sched_setscheduler(process.pid, os.SCHED_OTHER, os.sched_param(0))
     niceness = os.getpriority(os.PRIO_PROCESS, 0) + NICENESS
     os.setpriority(os.PRIO_PROCESS, process.pid, niceness)
+    with suppress(OSError):  # a kernel that does not share the processors between sessions
+        Path(f'/proc/{process.pid}/autogroup').write_text(str(niceness))
     return process
 
 
