@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.options import BAD_INPUT, DONE, FAILED
+from backlash_ros.tools.records.columns import parse_columns
 
 NOTHING = '–'  # in a table, where there is no number
 
@@ -49,6 +50,9 @@ OPTIONS: dict[str, dict[str, Any]] = {
     '--sweep': {
         'action': 'append', 'default': [], 'metavar': 'KEY=v1,v2,...',
         'help': 'run every value of a parameter; given again, every combination'},
+    '--columns': {
+        'type': parse_columns, 'default': {}, 'metavar': 't=…,v=…,y=…', 'help': 'which columns of '
+        'a table, or signals of a bag, these are (default: told by their names)'},
     '--axis': {
         'default': '', 'metavar': 'NAME', 'help': 'of several axes or joints: the one that is '
         'meant'},

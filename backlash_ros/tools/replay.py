@@ -26,7 +26,6 @@ from backlash_ros.options import OptionParser
 from backlash_ros.tools import cli, figures
 from backlash_ros.tools.batch import combinations
 from backlash_ros.tools.config import parse_setting
-from backlash_ros.tools.records.columns import parse_columns
 from backlash_ros.tools.records.reading import read_run_or_log
 from backlash_ros.tools.report import REPORT_PAGE, write_report
 from backlash_ros.tools.runs.bag import read_reports
@@ -65,13 +64,11 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('runs', type=Path, nargs='+', metavar='RUN',
                         help='a bag, a folder of results, or a log, as identify reads it, with '
                              '--config; several give a table')
-    parser.add_argument('--columns', type=parse_columns, default={}, metavar='t=…,v=…,y=…',
-                        help='which columns of a log these are (default: told by their names)')
     parser.add_argument('--config', type=Path, metavar='FILE',
                         help='parameters (default: parameters.yaml beside the run)')
     parser.add_argument('--set', action='append', default=[], metavar='KEY=VALUE',
                         dest='settings', help='change one parameter; may be given again')
-    cli.add_options(parser, '--sweep', '--axis', '--from', '--to', '--out')
+    cli.add_options(parser, '--columns', '--sweep', '--axis', '--from', '--to', '--out')
     return parser
 
 
@@ -101,8 +98,6 @@ def _opened(path: Path, options: argparse.Namespace, span: cli.Span) -> Source:
     run, applied = read_run_or_log(path, options.config, span, options.axis, options.columns)
     for text in run.notes:
         print(f'replay: {"warning: " if applied is None else ""}{text}', file=sys.stderr)
-    if run.record.samples == 0:
-        raise cli.InputError(f'{path}: holds no sample')
     if run.parameters is None:
         raise cli.InputError(f'{path}: ' + (
             'no parameters.yaml stands beside it: give --config' if applied is None else

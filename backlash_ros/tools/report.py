@@ -21,7 +21,6 @@ from backlash_ros.tools.cli import NOTHING, number
 from backlash_ros.tools.config import write_config
 from backlash_ros.tools.figures import png
 from backlash_ros.tools.page import Picture, facts, page, table
-from backlash_ros.tools.records.columns import parse_columns
 from backlash_ros.tools.records.reading import read_run_or_log
 from backlash_ros.tools.runs import files
 from backlash_ros.tools.runs import summary as told
@@ -190,11 +189,9 @@ def make_parser() -> argparse.ArgumentParser:
     parser = OptionParser('report', description=__doc__)
     parser.add_argument('path', type=Path, help='a bag or its .mcap file, a folder of results, '
                         'samples.csv, or a log as identify reads it')
-    parser.add_argument('--columns', type=parse_columns, default={}, metavar='t=…,v=…,y=…',
-                        help='which columns of a log these are (default: told by their names)')
     parser.add_argument('--config', type=Path, metavar='FILE',
                         help='parameters of the run (default: parameters.yaml beside it)')
-    cli.add_options(parser, '--axis', '--from', '--to', '--out')
+    cli.add_options(parser, '--columns', '--axis', '--from', '--to', '--out')
     return parser
 
 
@@ -205,8 +202,6 @@ def _report(args: Sequence[str] | None) -> None:
     run, _ = read_run_or_log(
         options.path.resolve(), options.config, span, options.axis, options.columns
     )
-    if run.record.samples == 0:
-        raise cli.InputError(f'{options.path}: holds no sample')
     out = files.result_directory(options.out)
     write_report(run, out)
     print(out / REPORT_PAGE)

@@ -11,7 +11,6 @@ from pathlib import Path
 from backlash_ros.core.parameters.parameter import Value
 from backlash_ros.options import FAILED, OptionParser, add_motion_options, positive
 from backlash_ros.tools.cli import add_options, run_tool, span_of
-from backlash_ros.tools.records.columns import parse_columns
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -23,9 +22,6 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('record', type=Path, nargs='?', metavar='RECORD',
                         help='a bag, a folder of results, or a table (CSV and the like, Parquet) '
                              'with the time, the command v and the output y')
-    parser.add_argument('--columns', type=parse_columns, default={}, metavar='t=…,v=…,y=…',
-                        help='which columns of the table, or signals of the bag, these are '
-                             '(default: told by their names)')
     parser.add_argument('--period', type=positive, metavar='S',
                         help='time from sample to sample [s] (default: told by the stamps)')
     parser.add_argument('--config', type=Path, metavar='FILE',
@@ -41,7 +37,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('--slope', type=positive, default=1.0, metavar='M',
                         help='m, a gear ratio for instance; it cannot be told from the gain of G '
                              '(default: 1)')
-    add_options(parser, '--axis', '--from', '--to', '--out')
+    add_options(parser, '--columns', '--axis', '--from', '--to', '--out')
     drive = parser.add_argument_group('with --drive')
     drive.add_argument('--drive', action='store_true',
                        help='move the actuator within control.min, control.max and '

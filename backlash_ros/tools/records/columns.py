@@ -5,8 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 
-from backlash_ros.core.records.record import RecordError
-
 ROLES = ('t', 'v', 'y')
 COMMAND = 'command'  # a fourth one, where v is what a motor encoder reports
 
@@ -58,6 +56,8 @@ def choose_columns(names: Sequence[str], given: Mapping[str, str]) -> tuple[dict
     given: by role, as the user says. Raises RecordError that names the columns where one is missing
     or several may be meant.
     """
+    from backlash_ros.core.records.record import RecordError  # loads NumPy
+
     for role, name in given.items():
         if name not in names:
             raise RecordError(f'--columns {role}={name}: {columns_of(names)}')

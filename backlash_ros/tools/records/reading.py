@@ -88,7 +88,10 @@ def read_run_or_log(
     no_run: InputError | None = None
     if not _is_table(path) or _is_samples(path):
         try:
-            return read_run(path, config, span, axis), None
+            run = read_run(path, config, span, axis)
+            if not run.record.samples:
+                raise InputError(f'{path}: holds no sample')
+            return run, None
         except InputError as error:
             if find_bag(path) is None:
                 raise
@@ -99,8 +102,8 @@ def read_run_or_log(
         record = _of_period(path, period, span, axis, columns)
     except InputError as error:
         raise no_run or error from None
-    run, applied = _as_run(record)
-    return Run(run, parameters, None, (record.timing, *record.notes)), applied
+    of_log, applied = _as_run(record)
+    return Run(of_log, parameters, None, (record.timing, *record.notes)), applied
 
 
 def _is_samples(path: Path) -> bool:
