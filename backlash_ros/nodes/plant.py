@@ -110,9 +110,7 @@ class PlantNode(ProcessNode):
         self.log.info(f'{self._plant.sample} samples' + (f', {counts}' if counts else ''))
 
     def _take_up(self, before: Parameters) -> None:
-        plant = build_plant(self.settings)
-        plant.go_on_from(self._plant)
-        self._plant = plant
+        self._plant.change(self.settings)
 
     def _start(self) -> None:
         self._started = True

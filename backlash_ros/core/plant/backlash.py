@@ -19,19 +19,6 @@ def clamp(held: float, low: float, high: float) -> float:
     return low if held <= low else high if held >= high else held
 
 
-def check_backlash(m: float, c_r: float, c_l: float, prefix: str = 'backlash') -> None:
-    """Raise ParameterError unless m > 0 and c_l < c_r, all finite."""
-    for name, value in (('m', m), ('c_r', c_r), ('c_l', c_l)):
-        if not isfinite(value):
-            raise ParameterError(f'{prefix}.{name}', value, 'must be finite')
-    if m <= 0.0:
-        raise ParameterError(f'{prefix}.m', m, 'must be > 0')
-    if c_l >= c_r:
-        raise ParameterError(
-            f'{prefix}.c_l', c_l, f'must be < {prefix}.c_r={c_r!r}', 'the gap is c_r - c_l'
-        )
-
-
 class Backlash:
     """Friction-driven hysteresis u = B[v] of slope m and crossings c_l < c_r, equation (2.1).
 
@@ -40,9 +27,14 @@ class Backlash:
     """
 
     def __init__(self, m: float, c_r: float, c_l: float, u: float = 0.0) -> None:
-        check_backlash(m, c_r, c_l)
-        if not isfinite(u):
-            raise ParameterError('backlash.initial_u', u, 'must be finite')
+        for name, value in (('m', m), ('c_r', c_r), ('c_l', c_l), ('initial_u', u)):
+            if not isfinite(value):
+                raise ParameterError(f'backlash.{name}', value, 'must be finite')
+        if m <= 0.0:
+            raise ParameterError('backlash.m', m, 'must be > 0')
+        if c_l >= c_r:
+            raise ParameterError('backlash.c_l', c_l, f'must be < backlash.c_r={c_r!r}',
+                                 'the gap is c_r - c_l')
         self.m, self.c_r, self.c_l, self.u = m, c_r, c_l, u
         self.region = Region.GAP
 

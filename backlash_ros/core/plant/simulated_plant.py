@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.actuator import Actuator, Motor
-from backlash_ros.core.plant.backlash import Backlash, check_backlash
+from backlash_ros.core.plant.backlash import Backlash
 from backlash_ros.core.plant.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
@@ -57,12 +57,10 @@ class SimulatedPlant:
         """What is added to u: a constant and a walk."""
         return self._p.input_disturbance + self._walk
 
-    def go_on_from(self, other: SimulatedPlant) -> None:
-        """Take over the state, the time and the source of noise of a plant with the same G(z)."""
-        self.sample, self._x, self._rng = other.sample, list(other._x), other._rng
-        self._walk, self._walk_rng = other._walk, other._walk_rng
-        self.backlash.u, self.backlash.region = other.backlash.u, other.backlash.region
-        self._motor, self.applied = other._motor, other.applied
+    def change(self, p: Parameters) -> None:
+        """Go on with other parameters; G(z), the actuator and the walk stay what they are."""
+        hidden = p.backlash
+        self._p, self.backlash = p, Backlash(hidden.m, hidden.c_r, hidden.c_l, self.backlash.u)
 
     def measure(self) -> float:
         """y(k) as the sensor shows it; call it once per sample."""
@@ -92,8 +90,7 @@ class SimulatedPlant:
         jump = hidden.jump if t >= hidden.jump_time else (0.0, 0.0, 0.0)
         m, c_r, c_l = (value + rate * t + step for value, rate, step in zip(
             (hidden.m, hidden.c_r, hidden.c_l), hidden.rate, jump, strict=True))
-        check_backlash(m, c_r, c_l)
-        self.backlash.m, self.backlash.c_r, self.backlash.c_l = m, c_r, c_l
+        self.backlash = Backlash(m, c_r, c_l, self.backlash.u)
 
 
 def delayed(model: TransferFunction, samples: int) -> TransferFunction:
