@@ -176,10 +176,7 @@ def _of_gaps(samples: Samples, like: Model) -> tuple[list[Model], tuple[Array, A
 
 
 def without_outliers(samples: Samples, found: Model) -> Samples:
-    """The same without readings that are none: far off, or the one before once more.
-
-    Rounding makes none of either.
-    """
+    """The same without readings that are none, by more than rounding: far off, or repeated."""
     y = samples.fitted_y()
     step = quantum(y)
     same = np.append(False, np.diff(y) == 0.0)
@@ -198,7 +195,6 @@ def later(early: StructureSearch, options: Options, progress: Progress) -> Struc
 
     The same structure is fitted with one sample of delay more and more, from the fit before.
     """
-    most_alike = 8  # delays that fit alike, beyond which none of them is told
     worse_for = 3  # delays in a row that fit worse, behind which no later one is tried
     progress('searching later delays')
     best, latest = early.best, min(LONGEST_DELAY, len(early.samples.v) // 20)
@@ -222,12 +218,15 @@ def later(early: StructureSearch, options: Options, progress: Progress) -> Struc
         for one in alike])))
     # What no G with a backlash explains, any delay explains a little better.
     other = what_it_is(observed_of(early.samples, best, Units()))
-    if last - first > most_alike or (other is not None and not other.known):
+    if other is not None and not other.known:
         return early
+    # Poles may stand for a part of a delay: where many fit alike, it is one of the last.
     late = searched(early.samples.v, early.samples.y, options, range(
-        max(first - 1, 0), min(last + 2, latest) + 1), progress)
-    better = effective(late.best.left) * log(max(best.rms, TINY) / max(late.best.rms, TINY))
-    return late if late.best.structure.delay < max(late.delays) and better > -ALIKE else early
+        max(first - 1, last - 5, 0), min(last + 2, latest) + 1), progress)
+    rows = effective(late.best.left)
+    better = rows * log(max(best.rms, TINY) / max(late.best.rms, TINY)) + 0.5 * log(rows) * (
+        best.structure.unknowns - late.best.structure.unknowns)
+    return late if late.best.structure.delay < max(late.delays) and better > 0.0 else early
 
 
 def observed_of(samples: Samples, best: Model, units: Units) -> Observed:
