@@ -117,18 +117,14 @@ class ReferenceWindow:
 
     def append(self, value: float) -> None:
         """Take in r(k + N)."""
-        end = self._end
-        if end == self._rows.shape[1]:
-            kept = self._kept - 1
-            self._rows[:, :kept] = self._rows[:, end - kept:]
-            self._start, end = 0, kept
-        self._rows[:2, end] = value
-        self._rows[2, end] = self.noise_gains[0]
-        self._end = end + 1
+        self._rows[1, self._end] = value
+        self._end += 1
 
     def settle(self) -> None:
         """Make of the newest reference what only the next sample needs."""
         newest, half = self._end - 1, self._parabolas.half
+        self._rows[0, newest] = self._rows[1, newest]
+        self._rows[2, newest] = self.noise_gains[0]
         self._noise.take(self._rows.item(0, newest))
         std = self._noise.std
         if half and std > 0.0 and newest - self._start >= 2 * half:
@@ -140,6 +136,9 @@ class ReferenceWindow:
             first = self._end - self._preview - 1
             last = max(self._end - half, first + 1)
             self.u_noise_std = std * float(self._rows[2, first:last].max())
+        if self._end == self._rows.shape[1]:
+            self._rows[:, :self._kept] = self._rows[:, -self._kept:]
+            self._start, self._end = 0, self._kept
 
     def _average(self, at: int) -> None:
         """Average one reference, now that as many after it are known."""
