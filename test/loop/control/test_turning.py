@@ -6,8 +6,13 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from backlash_ros.core.assembly import build_model
+from backlash_ros.core.control.tracking.design import Weights, design
+from backlash_ros.core.control.tracking.feedback import TRUSTED_AFTER, StateFeedback, Trust
 from backlash_ros.core.control.tracking.tracking import Tracking
+from backlash_ros.core.control.tracking.trajectory import IdealTrajectory
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.plant.backlash import Region
+from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
 from backlash_ros.core.reference.signal import ReferenceSignal
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.metrics import turns
@@ -106,3 +111,25 @@ def test_a_slow_crossing_begins_before_the_turn_and_ends_behind_it(take_up: floa
     samples = GAP / (take_up * PERIOD)
     # A parabola at the turn: what it does within half of the crossing, a few times per period.
     assert slowly < at_once + 0.5 * 0.5 * (3.0 * PERIOD * samples) ** 2
+
+
+SLOW = design(StateModel(TransferFunction([0.1], [1.0, -1.9, 0.9])), Weights(1e-2, 0.0, 10))
+
+
+def test_no_noise_of_y_hides_a_turn_beside_which_the_gap_is_small() -> None:
+    trajectory = IdealTrajectory(SLOW)
+    trajectory.begin(0.0)
+    for k in range(30):
+        trajectory.take(0.1 * k)
+        trajectory.turn(1e6, 1.0, 0.0, 0.0)
+        trajectory.prepare()
+    assert trajectory.state.side is Region.RIGHT
+
+
+def test_a_deviation_that_noise_explains_is_left_alone() -> None:
+    feedback = StateFeedback(SLOW, 1.0, 1e-3)
+    feedback.trust = Trust(held_for=TRUSTED_AFTER)
+    feedback.prepare(np.zeros((2, 2)), 1e-3)
+    assert feedback.u([3e-3, 0.0], held_back=False) == 0.0
+    full = SLOW.feedback.gain[0]
+    assert feedback.u([1e-2, 0.0], held_back=False) == pytest.approx(full * (1e-2 - 3.5e-3))

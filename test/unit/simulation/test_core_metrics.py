@@ -5,11 +5,7 @@ from math import exp, nan
 import numpy as np
 import pytest
 
-from backlash_ros.core.simulation.metrics import (
-    control_error_rms,
-    delayed_tracking_error_rms,
-    settling_time,
-)
+from backlash_ros.core.simulation.metrics import control_error_rms, settling_time
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 
 T = np.arange(1000) * 0.01
@@ -31,18 +27,11 @@ def test_settling_time_of_an_exponential_is_when_it_reaches_one_percent() -> Non
     assert settling_time(T, -estimate, -3.0 * ONES) == pytest.approx(4.61)
 
 
-def test_tracking_error_is_relative_and_taken_over_the_last_half() -> None:
-    y_m = 10.0 * np.sin(12.6 * T)
-    y = np.where(T < 5.0, 99.0, 1.03 * y_m)
-    assert delayed_tracking_error_rms(run(y=y, y_m=y_m), 0, 5.0) == pytest.approx(0.03)
-
-
 def test_run_without_samples_has_no_figures() -> None:
     nothing = run(samples=0)
     assert nothing.samples == 0
     assert not nothing.has_truth
     assert control_error_rms(nothing) is None
-    assert delayed_tracking_error_rms(nothing, 0) is None
     assert settling_time(T[:0], ONES[:0], ONES[:0]) is None
 
 

@@ -34,19 +34,13 @@ TOLERANCE = 21.0
 # Later only a drift is worth a step.
 CLOSE, SETTLING = 7.0, 200
 UNCERTAIN = 5.0  # the same in standard deviations of x, where that is more
-SHARE = 1e-5  # the same as a share of the largest |x*| so far, where that is more
 # How often y may be brought back by full feedback, and gently until the tolerance is doubled each
 # time, before it has rested for SETTLING samples.
 MOST_RETURNS = 2
 ASTRAY = 4.0  # tolerances beyond which y is not led back gently, but with full feedback
 ARRIVED = 0.5  # share of the tolerance within which v comes to rest after that
-STEADY = 0.004  # share of the tolerance by which x* may still move per sample
 OFF = 6.0  # standard deviations of y that mean a deviation while the state is unknown
-LED_BACK = 0.25  # share of what brings y back below which it is no longer needed
-TOO_WEAK = 0.5  # share of it with which y would not come back
 SHORT = 2.0  # standard deviations of the crossing by which v stops short of the u at rest
-GAIN = 1.5  # least factor by which a step has to lessen what u is off
-MATTERS = 0.25  # share of the tolerance that it must move x by
 
 
 class Mode(Enum):
@@ -111,9 +105,9 @@ class Rest:
         """
         state = self.state
         state.largest = max(state.largest, hypot(*plan.x))
-        least = SHARE * state.largest
-        steady = STEADY * max(TOLERANCE * noise_std, least)
-        if spread > noise_std or (state.mode is Mode.FOLLOW and plan.moved > steady):
+        least = 1e-5 * state.largest  # tolerance, where that is more
+        still = 0.004 * max(TOLERANCE * noise_std, least)  # by which x* may move per sample
+        if spread > noise_std or (state.mode is Mode.FOLLOW and plan.moved > still):
             state.mode, state.rested, state.returns, state.leads = Mode.FOLLOW, 0, 0, 0
         elif x_std is None:
             off = abs(y - r) > OFF * noise_std
@@ -146,8 +140,8 @@ class Rest:
                     state.turns, state.returns = 0, state.returns + 1
                 return Mode.RETURN
         if state.mode is Mode.LEAD_BACK:
-            # As long as it pulls the same way, and hard, or y is not yet near.
-            least = LED_BACK if size <= ARRIVED * state.limit else 0.0
+            # As long as it pulls the same way, and a quarter as hard, or y is not yet near.
+            least = 0.25 if size <= ARRIVED * state.limit else 0.0
             return Mode.LEAD_BACK if pull * state.pull > least * state.pull**2 else Mode.HOLD
         if size <= state.limit:
             return Mode.HOLD
@@ -179,12 +173,13 @@ class Rest:
         engaged = estimate.c_l if inverse.side is Region.LEFT else estimate.c_r
         u = estimate.m * (inverse.v - engaged)
         if state.mode is Mode.LEAD_BACK:
-            if begins or (u - ideal) * pull < TOO_WEAK * pull * pull:
+            if begins or (u - ideal) * pull < 0.5 * pull * pull:  # too weak to bring y back
                 self._aim(ideal + pull, u, 0.0, inverse)
             return
         side_std = estimate.std_c_r if ideal > u else estimate.std_c_l
         away, uncertain = abs(ideal - u), SHORT * side_std * estimate.m
-        if away * self._design.push > MATTERS * state.limit and away > max(GAIN * uncertain, noise):
+        # A step has to move x by a share of the tolerance, and to lessen what u is off.
+        if away * self._design.push > 0.25 * state.limit and away > max(1.5 * uncertain, noise):
             self._aim(ideal, u, SHORT, inverse)
 
     def _aim(self, u_d: float, u: float, shrinkage: float, inverse: BacklashInverse) -> None:

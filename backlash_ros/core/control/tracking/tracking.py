@@ -23,10 +23,6 @@ from backlash_ros.core.plant.backlash import Region
 from backlash_ros.core.plant.noise_level import NoiseLevel
 from backlash_ros.core.plant.transfer_function import StateModel
 
-# A better design takes over when v does not move much: samples after the first estimate, by then v
-# has crossed the gap with it; samples after a crossing, by then its last moves are over.
-SETTLED_AFTER, ENGAGED_AFTER = 150, 5
-FORESEEN = 6  # samples in which u* is neither to turn nor to hurry when another design takes over
 IN_FEEDBACK = 4.0  # times the noise of u* that feedback makes of the same noise
 NOISE_BAND = 4.0  # deviations of the noise in feedback that are worth a crossing of the gap
 FADING = 0.8  # per sample, of what is handed over
@@ -84,11 +80,14 @@ class Tracking(ControlStructure):
     @property
     def may_change(self) -> bool:
         """Whether v neither crosses the gap nor is about to."""
+        # Samples after the first estimate, by then v has crossed the gap with it; after a crossing,
+        # by then its last moves are over; and in which u* is neither to turn nor to hurry.
+        settled_after, engaged_after, foreseen = 150, 5, 6
         trust, plan = self.feedback.trust, self.trajectory.state
-        if trust.in_use_for < SETTLED_AFTER or self._engaged_for < ENGAGED_AFTER:
+        if trust.in_use_for < settled_after or self._engaged_for < engaged_after:
             return False
         # Neither a turn soon nor larger moves of v than those of late, as far as references say.
-        fastest, ahead = trust.slope * max(self._moves), plan.ahead[:FORESEEN + 1]
+        fastest, ahead = trust.slope * max(self._moves), plan.ahead[:foreseen + 1]
         rounding = 1e-9 * max(map(abs, ahead))
         return all(
             -rounding <= (after - before) * plan.side <= fastest + rounding
