@@ -66,7 +66,8 @@ def load_estimate(p: Parameters) -> Estimate | None:
         version, key, values = (content[part] for part in ('version', 'key', 'estimate'))
         key = dict(key)
         m, c_r, c_l, f, std_m, std_c_r, std_c_l = (
-            _number(values[part]) for part in (*NEEDED, *DEVIATIONS))
+            nan if values[part] is None else float(values[part])
+            for part in (*NEEDED, *DEVIATIONS))
     except (KeyError, TypeError, ValueError):
         raise refused('holds no saved estimates', 'delete it or name another one') from None
     estimate = Estimate(m, c_r, c_l, f, std_m, std_c_r, std_c_l)
@@ -95,11 +96,3 @@ def load_estimate(p: Parameters) -> Estimate | None:
 def _key(p: Parameters) -> dict[str, object]:
     return {name: list(value) if isinstance(value, tuple) else value
             for name, value in ((name, p[name]) for name in KEY)}
-
-
-def _number(value: object) -> float:
-    if value is None:
-        return nan
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise TypeError
-    return float(value)
