@@ -7,8 +7,8 @@ import time
 from collections import deque
 from collections.abc import Mapping
 from concurrent.futures import Future
-from dataclasses import dataclass, field
 from itertools import cycle
+from typing import NamedTuple
 
 from rclpy.duration import Duration
 from rclpy.subscription import Subscription
@@ -42,21 +42,12 @@ from backlash_ros.nodes.runtime.parameters import let_parameters_change
 from backlash_ros.nodes.runtime.process import emit, run
 
 
-@dataclass
-class Pairs:
+class Pairs(NamedTuple):
     """Lockstep: ticks of /clock [ns], references and outputs that wait for each other."""
 
-    ticks: deque[int] = field(default_factory=deque)
-    references: deque[float] = field(default_factory=deque)
-    outputs: deque[Output] = field(default_factory=deque)
-
-    def next(self) -> tuple[Output, float] | None:
-        """Output and reference of the next sample; None while something of it is missing."""
-        if not (self.ticks and self.references and self.outputs):
-            return None
-        # A tick is the sample: messages are not told apart by number then.
-        tick, y_m = self.ticks.popleft(), self.references.popleft()
-        return self.outputs.popleft()._replace(stamp_ns=tick, sequence=UNNUMBERED), y_m
+    ticks: deque[int]
+    references: deque[float]
+    outputs: deque[Output]
 
 
 class ControllerNode(ManagedNode):
@@ -89,7 +80,7 @@ class ControllerNode(ManagedNode):
         self._counter = SampleCounter(
             p.sample_period, from_zero=not p.lockstep and p.wait_for_subscribers > 0
         )
-        self._pairs = Pairs()
+        self._pairs = Pairs(deque(), deque(), deque())
         self._driver: Subscription | None = None  # plant_output, once it may begin
         self._ending: Timer | None = None  # sends the commands of on_timeout
         self.joints: list[Joint] = []
@@ -315,10 +306,11 @@ class ControllerNode(ManagedNode):
 
     def _answer_pairs(self) -> None:
         """Lockstep: answer as soon as tick, reference and output of a sample are there."""
-        loops = self.loops
-        while loops is not None and self.active and (pair := self._pairs.next()):
-            steps = loops.answer({'': pair[0]}, pair[1])
-            if steps:
+        loops, (ticks, references, outputs) = self.loops, self._pairs
+        while loops is not None and self.active and all(self._pairs):
+            # A tick is the sample: messages are not told apart by number then.
+            output = outputs.popleft()._replace(stamp_ns=ticks.popleft(), sequence=UNNUMBERED)
+            if steps := loops.answer({'': output}, references.popleft()):
                 loops.by_name[''].core.refine()
                 self._follow_up(loops, steps)
 

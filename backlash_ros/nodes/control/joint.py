@@ -9,7 +9,7 @@ from pathlib import Path
 
 from backlash_ros.core.assembly import build_controller, first_guess
 from backlash_ros.core.control.controller import ControlStep
-from backlash_ros.core.estimate import Estimate, Status
+from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.estimates_file import save_estimate, worth_saving
 from backlash_ros.core.loop.control_loop import ControlLoop, Driver
 from backlash_ros.core.loop.diagnosis import OF_MESSAGES, findings_of
@@ -95,9 +95,7 @@ class Joint:
         loop = self.loop
         assert loop is not None
         self.model.follow(loop, self.p.sample_period)
-        status, before = step.estimate.status, self.told
-        wrong = status is Status.INCONSISTENT and loop.core.estimator.report.wrong_sign
-        self.told = loop.phase, status, wrong
+        before, self.told = self.told, (loop.phase, step.estimate.status)
         return self.told != before
 
     def check_change(self, p: Parameters) -> None:
