@@ -121,7 +121,7 @@ def read_table(path: Path) -> Table:
     except (EOFError, OSError, zlib.error) as error:
         raise RecordError(f'cannot be read: {error}') from None
     if data[:4] == b'PAR1':
-        return _from_parquet(path)
+        return _from_parquet(path).by_name()
     wide = 'utf-16' if data[:2] in (b'\xff\xfe', b'\xfe\xff') else \
         'utf-16-le' if b'\0' in data and not data[1:200:2].strip(b'\0') else ''
     if b'\0' in data[:4096] and not wide:
