@@ -95,17 +95,20 @@ def saturation(o: Observed) -> Figures:
     family = o.family
     if family is None:
         return None
-    v, far = family.v, 0.1 * float(np.ptp(family.v))
-    for of_sensor, way in ((np.nanpercentile(o.y, 98.0), 1.0), (np.nanpercentile(o.y, 2.0), -1.0)):
-        runs = _runs(np.abs(o.y - of_sensor) < 4.0 * o.noise + 0.005 * o.swing)
+    v, swing = family.v, float(np.ptp(family.v))
+    for end, way in ((np.nanpercentile(o.y, 98.0), 1.0), (np.nanpercentile(o.y, 2.0), -1.0)):
+        within = 4.0 * o.noise + 0.005 * o.swing
+        runs = _runs(np.abs(o.y - end) < within)
         on = [float(np.max((o.v[run] - o.v[run[0]]) * way * np.sign(o.along))) for run in runs]
+        # What would move y by far more, if it moved.
+        far = max(0.1, 3.0 * within / o.swing) * swing
         if abs(o.along) > 0.3 and sum(size > far for size in on) >= 3:
-            return {'end': float(of_sensor), 'on': max(on)}
+            return {'end': float(end), 'on': max(on)}
 
     def ended(width: float, low: float, high: float) -> Array:
         return np.clip(family.play(width), low, high)
 
-    starts = [(width, float(v.min()) + 10.0 * low * far, float(v.min()) + 10.0 * high * far)
+    starts = [(width, float(v.min()) + low * swing, float(v.min()) + high * swing)
               for width in (o.one_play.at[0], 0.0)
               for low, high in ((-1.0, 0.75), (0.25, 2.0), (0.2, 0.8), (0.35, 0.65))]
     found = family.best(ended, starts)
@@ -113,11 +116,13 @@ def saturation(o: Observed) -> Figures:
         return None
     width, low, high = found.at
     p = family.play(width)
-    beyond = np.maximum(p - high, low - p)
-    there = beyond[family.rows] > 0.0
-    if not beyond.max() > far or not there.any():
-        return None
-    return {'end': float(np.median(family.target[there])), 'on': float(beyond.max())}
+    for beyond in (p - high, low - p):
+        y, on_by = family.target[beyond[family.rows] > 0.0], float(beyond.max())
+        # A y that only moves less there is at no end.
+        moves = 0.3 * o.swing * on_by / swing + 3.0 * o.noise
+        if on_by > 0.1 * swing and len(y) and np.ptp(np.percentile(y, [25.0, 75.0])) < moves:
+            return {'end': float(np.median(y)), 'on': on_by}
+    return None
 
 
 def pushed(o: Observed) -> Figures:
