@@ -5,6 +5,7 @@ import pytest
 from scipy import signal
 from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR
 
+from backlash_ros.core.assembly import build_four_blocks, build_structure
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.four_blocks import place_poles
@@ -31,10 +32,12 @@ def test_loop_without_backlash_answers_as_the_reference_model_says(filter_pole: 
     np.testing.assert_allclose(
         run.column('y'), answer(blocks.reference, run.column('y_m')), atol=1e-6
     )
+    ramp = np.arange(400.0)
+    late = ramp[-1] - answer(blocks.reference, ramp)[-1]
+    assert build_structure(p).delay == round(late) > 0
 
 
 def closed_of(p: Parameters) -> np.ndarray:
-    from backlash_ros.core.assembly import build_four_blocks
     return build_four_blocks(p).reference.denominator
 
 
