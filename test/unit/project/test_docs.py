@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+import accuracy
 import pytest
 import yaml
 from generate_parameters import parameters_page
@@ -97,6 +98,12 @@ def test_every_picture_is_shown() -> None:
 
 def test_page_of_parameters_is_current() -> None:
     assert (DOCS / 'reference' / 'parameters.md').read_text() == parameters_page(), 'call make docs'
+
+
+def test_every_row_of_the_contract_has_a_reference_and_a_section_of_the_page() -> None:
+    assert list(accuracy.read_rows(accuracy.REFERENCE)) == list(accuracy.ROWS)
+    sections = re.findall('^## (.+)$', accuracy.PAGE.read_text(), re.MULTILINE)
+    assert sections == [name.capitalize() for name in accuracy.ROWS]
 
 
 def test_parameters_that_pages_name_exist() -> None:
