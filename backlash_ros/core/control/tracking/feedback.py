@@ -172,16 +172,17 @@ class StateFeedback:
             return [0.0] * len(x)
         return [float(x_hat[i]) - each for i, each in enumerate(x)]
 
-    def u(self, deviation: Sequence[float], held_back: bool) -> float:
+    def u(self, deviation: Sequence[float], held_back: bool, largest: float) -> float:
         """What is taken from u*.
 
-        held_back: whether v met its limits, or is on its way across the gap.
+        held_back: whether v met its limits, or is on its way across the gap. largest: |x*| so far.
         """
         widening = 1.03  # per sample, of the bound on feedback while the backlash is unknown
         state, most = self.state, self.most
         if self.trust.begun:
             off = hypot(*deviation)
-            gain = self._gain(held_back or state.bounded, off > ASTRAY / ARRIVED * self._ignored)
+            astray = off > max(largest, ASTRAY / ARRIVED * self._ignored)
+            gain = self._gain(held_back or state.bounded, astray)
             feedback = dot(gain, deviation)
             if self.trust.full and self._x_cov is not None:
                 feedback *= 1.0 - self._ignored / max(off, self._ignored)
@@ -235,7 +236,8 @@ class StateFeedback:
     def _gain(self, held_back: bool, astray: bool) -> Gain:
         """K, or the less of it the longer v does not follow, and the newer the estimate.
 
-        astray: whether y is so far away that it does not matter what noise makes v do.
+        astray: whether y is further away than the trajectory has gone so far, and than noise
+        leads it: then it does not matter what noise makes v do.
         """
         stiffen_after = 20  # samples without a limit after which feedback takes a step back to full
         state, schedule = self.state, self._design.schedule

@@ -126,7 +126,7 @@ class Tracking(ControlStructure):
         if not trajectory.references.empty:
             state, plan = replace(feedback.state), trajectory.state
             deviation = feedback.deviation(source.x_hat, plan.x)
-            due = plan.u - feedback.u(deviation, held_back=False)
+            due = plan.u - feedback.u(deviation, False, self.rest.state.largest)
             feedback.state = state  # this was no sample
             self.hand_over = HandOver(due=due, widens=True)
             trajectory.advance()  # the plant is at the next sample when the next command is made
@@ -153,7 +153,8 @@ class Tracking(ControlStructure):
         turned = self.trajectory.turn(
             self._noise_std, estimate.m * (estimate.c_r - estimate.c_l), inverse.direction_band,
             crossing)
-        correction = feedback.u(deviation, inverse.limited or inverse.taking_up)
+        correction = feedback.u(
+            deviation, inverse.limited or inverse.taking_up, rest.state.largest)
         u_d = plan.u - correction
         # What the noise of the references makes of u* and is not followed shows as a deviation.
         noise = NOISE_BAND * feedback.noise + IN_FEEDBACK * plan.noise_band
