@@ -7,7 +7,6 @@ from math import inf
 from typing import Any, NoReturn
 
 DONE, FAILED, BAD_INPUT = 0, 1, 2  # exit codes
-LARGEST_PORT = 65535  # of TCP
 
 
 class OptionParser(argparse.ArgumentParser):
@@ -51,3 +50,11 @@ def add_motion_options(
         parser.add_argument(f'--{name}', type=positive, default=default, metavar=unit, help=text)
     parser.add_argument('--output-range', type=float, nargs=2, metavar=('LOW', 'HIGH'),
                         help='drive: stop when y leaves this range')
+
+
+def port(text: str) -> int:
+    """An option that is a port of TCP; argparse reports what is none."""
+    number = int(text)
+    if not 0 <= number <= 65535:
+        raise argparse.ArgumentTypeError(f'{text} must be from 0 (a free one) to 65535')
+    return number

@@ -23,7 +23,7 @@ from rclpy.utilities import remove_ros_args
 from backlash_ros.nodes import followed
 from backlash_ros.nodes.runtime.executor import PromptExecutor
 from backlash_ros.nodes.runtime.process import ENABLED, ProcessNode, emit, ros_arguments, run
-from backlash_ros.options import LARGEST_PORT
+from backlash_ros.options import port
 from backlash_ros.topics import BACKLASH
 
 HOST = '127.0.0.1'
@@ -174,11 +174,9 @@ def main(args: list[str] | None = None) -> int:
         'live', __doc__,
         'From elsewhere: ssh -L PORT:127.0.0.1:PORT HOST, then open the same address there.',
     )
-    parser.add_argument('--port', type=int, default=0, metavar='PORT',
+    parser.add_argument('--port', type=port, default=0, metavar='PORT',
                         help='of the page (default: a free one)')
     options = parser.parse_args(remove_ros_args(['', *arguments])[1:])
-    if not 0 <= options.port <= LARGEST_PORT:
-        parser.error(f'--port={options.port}: must be from 0 (a free one) to {LARGEST_PORT}')
     try:
         server = PageServer(options.port, kept=round(SHOWN_S / PAGE_PERIOD_S))
     except OSError as error:

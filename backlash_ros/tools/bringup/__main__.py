@@ -42,7 +42,7 @@ from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
 from backlash_ros import topics
-from backlash_ros.options import DONE, FAILED, OptionParser
+from backlash_ros.options import DONE, FAILED, OptionParser, port
 from backlash_ros.tools import cli
 from backlash_ros.tools.cli import BrokenOffError, InputError, StopRequests
 
@@ -65,7 +65,7 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
                         help='record a bag and write a report from it')
     parser.add_argument('--live', action='store_true',
                         help='show the loop on a page in the browser; its address is printed')
-    parser.add_argument('--live-port', type=int, metavar='PORT',
+    parser.add_argument('--live-port', type=port, metavar='PORT',
                         help='the same on this port (default: a free one)')
     return parser.parse_args(arguments)
 

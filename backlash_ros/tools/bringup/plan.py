@@ -14,7 +14,6 @@ from backlash_ros.core.assembly import build_controller, build_plant, build_refe
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.middleware.installed import ROS_MISSING, ros_is_missing
-from backlash_ros.options import LARGEST_PORT
 from backlash_ros.tools.bringup.environment import child_environment, foreign_environment
 from backlash_ros.tools.bringup.supervisor import Child
 from backlash_ros.tools.cli import BrokenOffError, InputError, number_of_samples, print_warnings
@@ -93,9 +92,6 @@ def prepare(options: argparse.Namespace) -> RunPlan:
             raise
     if options.unlimited and not any(values.driver for values in parameters.values()):
         raise InputError('--unlimited is about a driver: give --driver as well')
-    live_port = options.live_port if options.live_port is not None else 0 if options.live else None
-    if live_port is not None and not 0 <= live_port <= LARGEST_PORT:
-        raise InputError(f'--live-port={live_port}: must be from 0 (a free one) to {LARGEST_PORT}')
     users: dict[str, str] = {}
     for name, values in parameters.items():
         file = values.estimates.file
@@ -120,7 +116,7 @@ def prepare(options: argparse.Namespace) -> RunPlan:
             write_config(axis.parameters, axis.out / CONFIG_FILE)
     except OSError as error:
         raise InputError(f'{out}: cannot be written: {error.strerror}') from None
-    return RunPlan(axes, out, live_port)
+    return RunPlan(axes, out, 0 if options.live and not options.live_port else options.live_port)
 
 
 def _checked(p: Parameters, axis: str, options: argparse.Namespace) -> Parameters:

@@ -53,7 +53,7 @@ DRIVER = 'drive --axis {axis}'
     (['--config', 'nowhere.yaml'], ['nowhere.yaml']),
     (['--out', '/proc/nowhere'], ['/proc/nowhere']),
     (['--speed', '3'], ['--speed']),
-    (['--live-port', '70000'], ['--live-port=70000', 'must be from 0']),
+    (['--live-port', '70000'], ['--live-port', '70000 must be from 0']),
 ])
 def test_bad_input_is_refused_in_one_line_before_anything_is_made(
     arguments: list[str], words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
