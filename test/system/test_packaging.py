@@ -17,10 +17,11 @@ EXECUTABLES = {
 }
 COLCON = 'import sys; from colcon_core.command import main; sys.exit(main())'
 HOMES = """
-import inspect
+import sys
 from importlib.metadata import distribution
 for entry in distribution("backlash_ros").entry_points:
-    print(entry.name, inspect.getfile(entry.load()))
+    assert callable(entry.load())
+    print(entry.name, sys.modules[entry.module].__file__)
 """
 
 
@@ -56,8 +57,10 @@ def test_colcon_installs_what_the_tools_look_for_and_it_runs(tmp_path: Path) -> 
              for path in (base / folder).glob(pattern)} for base in (share / 'backlash_ros', ROOT)
         )
         assert shipped == own != {}
-    beside_modules = {path.name for path in installation.rglob('lib/python*/**/*.[hx]*ml')}
-    assert beside_modules == {'loopback.xml', 'network.xml', 'page.html'}
+    beside_modules = {path.name for path in installation.rglob('lib/python*/**/*')
+                      if path.suffix in ('.html', '.md', '.mplstyle', '.xml')}
+    assert beside_modules == {'comparison.md', 'figures.mplstyle', 'live.html', 'loopback.xml',
+                              'network.xml', 'page.html'}
     executables = installation / 'lib' / 'backlash_ros'
     assert {path.name for path in executables.iterdir() if os.access(path, os.X_OK)} == EXECUTABLES
     script = f'. "{installation.parent}/local_setup.bash" && env -0'
