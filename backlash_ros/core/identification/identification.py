@@ -174,11 +174,12 @@ def _described(
         # Whatever the correlation: what explains nine tenths of y shows v.
         inf if squares < 0.1 * still
         else 0.5 * effective(residual) * log(still / max(squares, TINY)),
-        correlation, held_out.rms, held_out.trained,
+        correlation, held_out.rms / max(held_out.trained, 1e-300),
         [(units.v_size * rival, behind) for rival, behind in s.rivals], best.reversals, step,
-        cancelled_poles(best), structure.delay,
+        cancelled_poles(best),
         # Where many fit alike, the gap does not depend on the delay.
-        structure.delay == max(s.delays) and len(delays) < 3 and _delay_open(s.samples, best),
+        structure.delay * (structure.delay == max(s.delays) and len(delays) < 3
+                           and _delay_open(s.samples, best)),
     ))
     # What no model explains moves both sides of the gap alike.
     more = 0.25 * (verdict.gap_std**2 - gap_var)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -218,17 +218,8 @@ def stick_slip(o: Observed) -> Figures:
     return {'stuck': stuck, 'jump': float(np.percentile(np.abs(np.diff(y)), 99.0))}
 
 
-def coasting(o: Observed) -> Figures:
-    """A load that goes on the way that it went, while v crosses the gap."""
-    return _off_in_gap(o, onwards=True)
-
-
-def moved_in_gap(o: Observed) -> Figures:
-    """A load that something else moves while v crosses the gap."""
-    return _off_in_gap(o, onwards=False)
-
-
-def _off_in_gap(o: Observed, onwards: bool) -> Figures:
+def off_in_gap(o: Observed, onwards: bool) -> Figures:
+    """A load that goes on the way that it went while v crosses the gap, or that is moved there."""
     if o.gap < 0.003 * float(np.ptp(o.v)):
         return None
     crossing = np.append(False, (np.diff(o.p) == 0.0) & (np.diff(o.v) != 0.0))
@@ -277,9 +268,10 @@ SYMPTOMS = (
     Symptom(stick_slip, 'y sticks and slips: it stays for {stuck:.0%} of the time in which it '
             'should move, and goes on in jumps of up to {jump:.2g}: friction',
             'loosen it, or move faster'),
-    Symptom(coasting, f'{IN_GAP}: it coasts there', 'brake it, or move more slowly', True),
-    Symptom(moved_in_gap, f'{IN_GAP}: something else moves it there', 'hold it, or keep it free',
-            True),
+    Symptom(partial(off_in_gap, onwards=True), f'{IN_GAP}: it coasts there',
+            'brake it, or move more slowly', True),
+    Symptom(partial(off_in_gap, onwards=False), f'{IN_GAP}: something else moves it there',
+            'hold it, or keep it free', True),
 )
 
 

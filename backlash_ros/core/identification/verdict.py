@@ -54,11 +54,11 @@ class Findings(NamedTuple):
     of the gap by other structures. gain: mean response of y to v where y moves, static: at rest
     (negative where y moves against v). gain_std, response_std: relative deviations of the gain at
     rest, and of G where y moves. evidence: log-likelihood by which the fit beats a u that stands
-    still. correlation: of successive residuals beyond chance. held_out, trained: rms of the errors
-    on the samples held out and on the others. rivals: other gaps with the log-likelihood by which
+    still. correlation: of successive residuals beyond chance. later: rms of the errors on the
+    samples held out over that on the others. rivals: other gaps with the log-likelihood by which
     they fall behind. reversals: of p. quantum: of y, 0 for none. cancelled: poles that zeros
-    cancel. delay [samples], delay_open: whether it is the longest that was compared, and a longer
-    one fits as well.
+    cancel. open_delay [samples]: the longest that was compared, where a longer one fits as well,
+    else 0.
     """
 
     observed: Observed
@@ -73,14 +73,12 @@ class Findings(NamedTuple):
     response_std: float
     evidence: float
     correlation: float
-    held_out: float
-    trained: float
+    later: float
     rivals: Sequence[tuple[float, float]]
     reversals: int
     quantum: float
     cancelled: Sequence[complex]
-    delay: int
-    delay_open: bool
+    open_delay: int
 
     @property
     def swing(self) -> float:
@@ -136,8 +134,8 @@ def _doubts(f: Findings) -> list[Doubt]:
               'that moves by itself, or a higher order with --order'),
         Doubt(f.apart, 'other orders or delays fit nearly as well, with another gap', several),
         # A delay that is too short by a sample looks like a gap that is wider by its motion of v.
-        Doubt(f.delay_open * float(np.abs(np.diff(o.v)).mean()), 'the delay may be a longer one',
-              'compare longer ones with --delay'),
+        Doubt(bool(f.open_delay) * float(np.abs(np.diff(o.v)).mean()),
+              'the delay may be a longer one', 'compare longer ones with --delay'),
     ]
     if o.unexplained and o.family is not None:
         gap, squares = abs(o.one_play.at[0]), o.one_play.squares / len(o.family.rows)
@@ -238,16 +236,15 @@ def _remarks(f: Findings) -> list[str]:
     speeds = np.abs(np.diff(f.observed.v))
     speeds = speeds[speeds > 0.01 * speeds.max(initial=0.0)]
     one_speed = len(speeds) > 0 and np.std(speeds) < 0.05 * np.mean(speeds)
-    later = f.held_out / max(f.trained, 1e-300)
     pole = '' if not f.cancelled else (
         f'{f.cancelled[0].real:.4g}' if abs(f.cancelled[0].imag) < 1e-9 else
         f'{f.cancelled[0]:.4g}')
     return [text for true, text in (
         (f.static < 0.0 and f.gain_std <= PRECISE,
          'y moves against v: the gain of G is negative'),
-        (f.delay_open,
-         f'the delay of {f.delay} samples is the longest that was compared, and the gap may have '
-         f'some of a longer one: try --delay {f.delay}-{min(2 * f.delay + 4, 40)}'),
+        (f.open_delay > 0,
+         f'the delay of {f.open_delay} samples is the longest that was compared, and the gap may '
+         f'have some of a longer one: try --delay {f.open_delay}-{min(2 * f.open_delay + 4, 40)}'),
         (WORTH_A_WORD < share <= 1.0,
          f'{share:.0%} of the motion that the gap makes follows from no backlash and no linear G: '
          'the deviations tell of it'),
@@ -256,8 +253,8 @@ def _remarks(f: Findings) -> list[str]:
          'several speeds'),
         (pole, f'the pole {pole} is cancelled by a zero: a lower order does as well; limit '
          '--order'),
-        (later > 2.0 and f.rms > f.observed.noise,
-         f'the last part of the record is predicted {later:.2g} times worse than the rest is '
+        (f.later > 2.0 and f.rms > f.observed.noise,
+         f'the last part of the record is predicted {f.later:.2g} times worse than the rest is '
          'fitted: the plant changed on the way, or the record is short'),
     ) if true]
 

@@ -21,7 +21,7 @@ from backlash_ros.core.identification.result import Details, Identification, Opt
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.parameter import Value
 from backlash_ros.core.records.record import Record
-from backlash_ros.tools.cli import NOTHING, BrokenOffError, format_table
+from backlash_ros.tools.cli import BrokenOffError, format_table
 from backlash_ros.tools.identify.identified_file import (
     alike,
     as_estimate,
@@ -139,7 +139,7 @@ def _page(
     notes = (*(() if verdict is None else verdict.lines), *_other_reasons(found), *found.remarks,
              *record.notes)
     parts = [] if found.details is None else [
-        _numbers(found) + _facts(found, record), _compared(found.details)]
+        _numbers(found) + _facts(found, found.details, record), _compared(found.details)]
     folded = None if parameters is None else ('identified.yaml', parameters)
     return page('Identification of backlash and G(z)', lead, notes, parts, pictures, folded)
 
@@ -155,9 +155,8 @@ def _numbers(found: Identification) -> str:
     ])
 
 
-def _facts(found: Identification, record: Record) -> str:
-    band = hertz(found)
-    held_out = found.details and found.details.held_out
+def _facts(found: Identification, details: Details, record: Record) -> str:
+    band, held_out = hertz(found), details.held_out
     quantum = f', steps of {found.quantum:.3g}' if found.quantum else ''
     return facts([
         ('time', escape(record.timing)),
@@ -170,8 +169,7 @@ def _facts(found: Identification, record: Record) -> str:
         ('G is known to', f'{100.0 * found.response_std.max():.2g} %, {band[0]:.2g} to '
                           f'{band[-1]:.2g} Hz'),
         ('noise of y', f'{found.noise_std:.3g}{quantum}'),
-        ('error on samples held out', NOTHING if held_out is None else
-         f'{held_out.rms:.3g} (fit: {held_out.trained:.3g})'),
+        ('error on samples held out', f'{held_out.rms:.3g} (fit: {held_out.trained:.3g})'),
         ('correlation of the residual', f'{found.correlation:.2g} from sample to sample'),
         ('lost samples, outliers', f'{record.lost}, {found.outliers}'),
     ], columns=1)

@@ -13,8 +13,8 @@ GOOD = observed(V, behind(play(V, GAP), 'lag'))
 SAW = 0.02 * np.abs(np.arange(3000) % 400 - 200.0)
 FOUND = Findings(
     GOOD, gap=GAP, gap_std=0.01, apart=0.0, c_r=0.3, c_r_std=0.01, gain=0.8, static=1.0,
-    gain_std=0.01, response_std=0.02, evidence=1e3, correlation=0.0, held_out=NOISE,
-    trained=NOISE, rivals=(), reversals=20, quantum=0.0, cancelled=(), delay=1, delay_open=False,
+    gain_std=0.01, response_std=0.02, evidence=1e3, correlation=0.0, later=1.0,
+    rivals=(), reversals=20, quantum=0.0, cancelled=(), open_delay=0,
 )
 
 
@@ -114,9 +114,9 @@ def test_a_gap_that_changes_is_told_with_its_values_and_widens_the_deviation() -
 
 @pytest.mark.parametrize(('changed', 'said'), [
     ({'static': -1.0}, 'the gain of G is negative'),
-    ({'delay': 3, 'delay_open': True}, 'try --delay 3-10'),
+    ({'open_delay': 3}, 'try --delay 3-10'),
     ({'cancelled': [0.97 + 0j]}, 'the pole 0.97 is cancelled'),
-    ({'held_out': 0.2, 'trained': 0.01, 'observed': replace(GOOD, noise=1e-4)}, '20 times worse'),
+    ({'later': 20.0, 'observed': replace(GOOD, noise=1e-4)}, '20 times worse'),
     ({'observed': observed(SAW, behind(play(SAW, GAP), 'lag'))}, 'one speed only'),
 ])
 def test_what_to_know_is_remarked(changed: dict[str, Any], said: str) -> None:
