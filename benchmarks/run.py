@@ -129,7 +129,8 @@ def measure_cost(duration_s: float) -> Section:
         'What it costs',
         'The default controller and `reference` as processes, beside a bare rclpy node that '
         'publishes every number it gets, at the same rate; once the backlash is known. Times are '
-        'those of processors, of all threads; the process for fits is not counted.', COST_HEADER,
+        'those of processors, of all threads; `its fits`: of the process that makes them.',
+        COST_HEADER,
     )
     for rate in COST_RATES_HZ:
         rows, checks = measure_costs(rate, duration_s)

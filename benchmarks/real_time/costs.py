@@ -25,7 +25,7 @@ COST_HEADER = ('rate', 'process', 'processor [%]', 'per sample [us]', '/ echo', 
 COST_RATES_HZ = (100.0, 200.0)
 WARM_UP_S = 6.0  # acquisition is not counted
 MEMORY_LIMIT_MB, START_LIMIT_S = 80.0, 1.0
-NODES = ('controller', 'reference', 'echo')
+NODES = ('controller', 'its fits', 'reference', 'echo')
 
 
 class Driver(MeasuringNode):
@@ -85,6 +85,8 @@ def measure_costs(
             first_s = driver.wait_for_command() - began
             driver.run(round(WARM_UP_S * rate))
             pids = {child.name: child.process.pid for child in supervisor.children}
+            worker = Path(f'/proc/{pids["controller"]}/task/{pids["controller"]}/children')
+            pids['its fits'] = int(worker.read_text().split()[0])
             samples = round(duration_s * rate)
             before, began = {name: processor_s(pid) for name, pid in pids.items()}, time.time()
             driver.run(samples)
