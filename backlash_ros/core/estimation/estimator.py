@@ -11,7 +11,6 @@ whichever sample that belongs to. docs/estimation.md explains the method and mea
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache
 from math import hypot, nan
 from typing import NamedTuple
 
@@ -46,25 +45,19 @@ class Proposal(NamedTuple):
 
 
 class Fitted(NamedTuple):
-    """What comes of a fit: what is believed, where play and G stand, a better G if there is one.
-
-    gains: of the observer of the G whose state is wanted, where they were asked for.
-    """
+    """What comes of a fit: what is believed, where play and G stand, a better G if there is one."""
 
     belief: Belief
     place: Place | None = None
     proposal: Proposal | None = None
-    gains: Gains | None = None
 
 
 def fitted(
     samples: ChannelSamples, setup: Setup, before: Belief, model: TransferFunction, proposed: Array,
-    with_gains: bool,
 ) -> Fitted:
     """What is believed with these samples: the job that is done beside the loop.
 
     model: the G whose state the structure wants. proposed: xi (K,) of the newest proposal.
-    with_gains: whether the gains of the observer of `model` are wanted.
     """
     record = Window(samples.first, *samples.columns).swapped(before.swapped)
     belief = learn(setup, record.between(max(before.first, record.end - LONGEST)), before)
@@ -73,17 +66,11 @@ def fitted(
         return Fitted(belief)
     part = record.swapped(belief.swapped - before.swapped).between(belief.first, belief.end)
     place = place_of(fit, part, model, setup.family.memory)
-    gains = _gains_of(tuple(model.numerator), tuple(model.denominator)) if with_gains else None
     if not len(proposed) or not belief.trusted or fit.behind(proposed) <= 1.0:
-        return Fitted(belief, place, None, gains)
-    better = StateModel(setup.family.model_at(fit.xi))
-    return Fitted(belief, place, Proposal(better, fit.theta[3:], gains_of(better)), gains)
-
-
-# Remembered: where jobs are done at once, every run of a process would make them anew.
-@lru_cache(maxsize=16)
-def _gains_of(numerator: tuple[float, ...], denominator: tuple[float, ...]) -> Gains:
-    return gains_of(StateModel(TransferFunction(numerator, denominator)))
+        return Fitted(belief, place)
+    better = setup.family.model_at(fit.xi)
+    return Fitted(
+        belief, place, Proposal(StateModel(better), fit.theta[3:], gains_of(better)))
 
 
 class MovingHorizon(Law):
@@ -259,7 +246,7 @@ class MovingHorizon(Law):
         proposed = np.zeros(setup.family.count) if self._proposal is None else self._proposal.xi
         channel.submit(
             fitted, setup, self._belief, self.model.transfer_function, proposed,
-            following.gains is None, since=self._belief.first,
+            since=self._belief.first,
         )
         self._take(channel.poll())
 
@@ -286,8 +273,6 @@ class MovingHorizon(Law):
         place, fit = result.place, belief.fit
         if place is None or fit is None:
             return
-        if result.gains is not None and following.is_of(place):
-            following.gains = result.gains
         if not belief.trusted and following.observer is not None:
             following.observer.settle(fit.noise)  # no fit says where the state is
             return

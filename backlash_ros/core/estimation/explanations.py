@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import inf, sqrt
+from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -88,10 +88,10 @@ class Window(NamedTuple):
 
 def problem_of(
     setup: Setup, record: Window, older: Prior | None = None, start: Start | None = None,
-    most_scale: float = inf, walk_std: float = 0.0,
+    walk_std: float = 0.0,
 ) -> Problem:
     """The fit of a record by this setup."""
-    return Problem(setup.family, record.v, record.y, setup.noise_std, older, start, most_scale,
+    return Problem(setup.family, record.v, record.y, setup.noise_std, older, start,
                    max(walk_std, setup.walk_std))
 
 
@@ -107,8 +107,7 @@ def afresh(
     family = setup.family
     if np.isfinite(record.y).sum() < 15 + 2 * family.count or np.ptp(record.v) == 0.0:
         return None
-    p = problem_of(setup, record) if like is None else \
-        problem_of(setup, record, of_xi(like), most_scale=like.scale)
+    p = problem_of(setup, record, None if like is None else of_xi(like))
     # The noise of a first step is at least a twentieth of the motion of y.
     noise = max(setup.noise_std, 0.05 * float(np.nanstd(record.y)))
     xi = np.zeros(family.count) if like is None else like.theta[3:]
@@ -199,9 +198,10 @@ def with_walk(setup: Setup, p: Problem, f: WindowFit) -> WindowFit:
     """
     shares = (0.005, 0.02, 0.08)  # of m times the gap, by which u may walk over the record
     best, least = f, setup.walk_std
+    begin = replace(f.without_intervals, knots=np.zeros(0), walk_std=least)
     if f.walk_std > least:
         still = p.walking(least)
-        best = with_intervals(still, still.fitted(f.without_intervals))
+        best = with_intervals(still, still.fitted(begin))
     if not best.valid or not best.systematic:
         return best
     for share in shares:
@@ -209,8 +209,8 @@ def with_walk(setup: Setup, p: Problem, f: WindowFit) -> WindowFit:
         if walk_std <= least:
             continue
         walking = p.walking(walk_std)
-        begin = replace(f.without_intervals, knots=np.zeros(0))
-        g = with_intervals(walking, walking.fitted(begin, FIRST_STEPS))
+        g = with_intervals(
+            walking, walking.fitted(replace(begin, walk_std=walk_std), FIRST_STEPS))
         needed = 0.0 if best.walk_std > least else FAR_BEHIND
         # Readings of which the walk leaves a correlated rest count as fewer.
         if g.valid and g.evidence - best.evidence > needed * g.inflation:

@@ -49,17 +49,17 @@ class Problem:
     """A record v, y (N,), y nan where lost, with what is known beside it.
 
     noise_std: nominal, a weak prior. older: what samples before the record say. start: where the
-    play rests, None where unknown. most_scale: of the error of G. walk_std: of u per square root
-    of a sample, 0 for none. step: of the readings, None to be told from them.
+    play rests, None where unknown. walk_std: of u per square root of a sample, 0 for none. step: of
+    the readings, None to be told from them.
     """
 
     def __init__(
         self, family: Family, v: Array, y: Array, noise_std: float,
-        older: Prior | None = None, start: Start | None = None, most_scale: float = inf,
-        walk_std: float = 0.0, step: float | None = None,
+        older: Prior | None = None, start: Start | None = None, walk_std: float = 0.0,
+        step: float | None = None,
     ) -> None:
         self.family, self.v, self.nominal = family, v, noise_std
-        self.older, self.start, self.most_scale = older, start, most_scale
+        self.older, self.start = older, start
         self.known = np.isfinite(y)
         self.y = np.where(self.known, y, 0.0)
         self.step_of_readings = step_of(y) if step is None else step
@@ -167,9 +167,7 @@ class Problem:
 
         r = dgeqrf(stack, overwrite_a=1)[0][:size + 1]
         return self._solved(
-            f, np.triu(r) * scale, order, float(self.weights(f).sum()),
-            min(most_scale, self.most_scale)
-        )
+            f, np.triu(r) * scale, order, float(self.weights(f).sum()), most_scale)
 
     def rows(self, f: WindowFit, held: bool = False, begun: bool = False) -> Array:
         """The least squares of a step: a row for each sample, then those beside, the target last.
@@ -305,10 +303,6 @@ class Problem:
             # Far from the optimum the error of the linearization passes for one of G.
             most = 1.0 if k < far_steps < steps else np.inf
             new, there, value = self._stepped(f, best, weights, most)
-            if not value > best - 0.5:
-                # A kink where the play began bars the way to all else: held there, it does not.
-                other = self._stepped(f, best, weights, most, begun=True)
-                new, there, value = max((new, there, value), other, key=lambda one: one[2])
             if not value > best - 50.0:  # f stands: only its posterior is new, and its noise
                 f = replace(f, cov=new.cov, prior=new.prior, scale=new.scale, volume=new.volume)
                 noise_std = f.noise_std if f.step else self._noise_of(f)
@@ -325,16 +319,16 @@ class Problem:
         return f
 
     def _stepped(
-        self, f: WindowFit, best: float, weights: Array, most_scale: float, begun: bool = False,
+        self, f: WindowFit, best: float, weights: Array, most_scale: float,
     ) -> tuple[WindowFit, WindowFit, float]:
         """What a step leads to, where it goes as far as that helps, and its log-posterior."""
         shortest_step = 0.05  # share of a Gauss-Newton step that is tried
-        new = self.kept(self.step(f, most_scale, begun=begun))
+        new = self.kept(self.step(f, most_scale))
         there = _towards(f, new)
         value = self.log_posterior(there, weights)
         if -inf < value <= best - 0.5:
             # Beyond a kink of the play, where another side was engaged, it may be better.
-            again = _towards(there, self.kept(self.step(there, most_scale, begun=begun)))
+            again = _towards(there, self.kept(self.step(there, most_scale)))
             of_again = self.log_posterior(again, weights)
             if of_again > best:
                 there, value = again, of_again

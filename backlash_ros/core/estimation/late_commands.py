@@ -32,19 +32,19 @@ from backlash_ros.core.plant.transfer_function import memory_of
 Array = NDArray[np.float64]
 
 
-def swapped(problem: Problem, fit: WindowFit, record: Window, since: int, back: frozenset[int],
-            ) -> frozenset[int]:
-    """Numbers of the samples from `since` on over which the other command acted.
+def likelier(problem: Problem, fit: WindowFit, record: Window, since: int, back: frozenset[int],
+             ) -> tuple[Window, frozenset[int]]:
+    """The record as it is likelier from `since` on, and where in it the other command acted.
 
-    problem: of the record. back: of the samples over which the other one acts already, so that its
-    odds are the reverse.
+    problem: of the record. back: numbers of the samples over which the other one acts already, so
+    that its odds are the reverse.
     """
     own_noise = 0.25  # of correlated residuals: what is noise of readings
     open_ = np.flatnonzero(np.isfinite(record.other))
     count, late = len(open_), len(record.places(back))
     open_ = open_[open_ >= since - record.first]
     if not len(open_) or fit.m <= 0.0:
-        return frozenset()
+        return record, back
     b, a = problem.family.at(fit.xi)
     modes = np.abs(np.roots(a))
     reach = memory_of(float(modes[modes < 1.0 - ON_CIRCLE].max(initial=0.0)))
@@ -85,7 +85,8 @@ def swapped(problem: Problem, fit: WindowFit, record: Window, since: int, back: 
         end = place + len(change)
         residual[place:end] -= change * known[place:end]
         p = play(v, fit.gap, fit.p0)
-    return frozenset(record.first + k for k in chosen)
+    found = frozenset(record.first + k for k in chosen)
+    return record.swapped(found), back ^ found
 
 
 def _change(v: Array, other: Array, p: Array, k: int, reach: int, fit: WindowFit) -> Array:
@@ -94,10 +95,3 @@ def _change(v: Array, other: Array, p: Array, k: int, reach: int, fit: WindowFit
     acting = v[k:end].copy()
     acting[0] = other[k]
     return play(acting, fit.gap, float(p[k - 1]) if k else fit.p0) - p[k:end]
-
-
-def likelier(problem: Problem, fit: WindowFit, record: Window, since: int, back: frozenset[int],
-             ) -> tuple[Window, frozenset[int]]:
-    """The record as it is likelier, and the numbers of all samples over which others acted."""
-    found = swapped(problem, fit, record, since, back)
-    return record.swapped(found), back ^ found

@@ -12,6 +12,7 @@ Automatic Control 15 (1970) 175-184).
 from __future__ import annotations
 
 from collections import deque
+from functools import lru_cache
 from math import isnan, nan, sqrt
 from operator import mul
 from typing import NamedTuple
@@ -78,8 +79,14 @@ def gain_of(model: StateModel, ratio: float) -> Gain | None:
     )
 
 
-def gains_of(model: StateModel) -> Gains:
+def gains_of(model: TransferFunction) -> Gains:
     """Gains for noise on u of every size."""
+    return _gains_of(tuple(model.numerator), tuple(model.denominator))
+
+
+@lru_cache(maxsize=16)
+def _gains_of(numerator: tuple[float, ...], denominator: tuple[float, ...]) -> Gains:
+    model = StateModel(TransferFunction(numerator, denominator))
     return {ratio: gain_of(model, ratio) for ratio in RATIOS}
 
 
@@ -165,7 +172,7 @@ class Place(NamedTuple):
     """Where play and G stand after the samples of a fit.
 
     p: of the play operator. u, y: over the newest samples (M,). x: state of `model` in the observer
-    form.
+    form. gains: of its observer.
     """
 
     p: float
@@ -173,6 +180,7 @@ class Place(NamedTuple):
     y: Array
     x: Array
     model: TransferFunction
+    gains: Gains
 
 
 def place_of(fit: WindowFit, record: Window, model: TransferFunction, memory: int) -> Place:
@@ -186,7 +194,7 @@ def place_of(fit: WindowFit, record: Window, model: TransferFunction, memory: in
     if len(fit.knots):
         u += walk(fit.knots, len(u))
     u = u[-count:]
-    return Place(float(p[-1]), u, y, state_after(model, u, y), model)
+    return Place(float(p[-1]), u, y, state_after(model, u, y), model, gains_of(model))
 
 
 def state_after(model: TransferFunction, u: Array, y: Array) -> Array:
@@ -204,16 +212,15 @@ def state_after(model: TransferFunction, u: Array, y: Array) -> Array:
 class Following:
     """Follows play operator and state of G from sample to sample.
 
-    model: G of the structure that asks for the state. gains: of its observer, None where they are
-    made one by one. before: gives the state until a backlash is known. observer: that does so from
-    then on. u: before the newest y; nan before a backlash is known. innovation: of the newest y.
-    since_motion: samples since p, or v before a backlash is known, moved. outliers: readings that
-    did not move the state. beyond: as many in a row, and those after them.
+    model: G of the structure that asks for the state. before: gives the state until a backlash is
+    known. observer: that does so from then on. u: before the newest y; nan before a backlash is
+    known. innovation: of the newest y. since_motion: samples since p, or v before a backlash is
+    known, moved. outliers: readings that did not move the state. beyond: as many in a row, and
+    those after them.
     """
 
     def __init__(self, model: StateModel, before: FixedBacklash | None) -> None:
         self.model, self.before = model, before
-        self.gains: Gains | None = None
         self.observer: Observer | None = None
         self.u = self.innovation = nan
         self.since_motion = self.outliers = self.beyond = 0
@@ -237,7 +244,7 @@ class Following:
 
     def change_model(self, model: StateModel, gains: Gains | None) -> None:
         """Give the state of this G from now on; gains: of its observer."""
-        self.model, self.gains = model, gains
+        self.model = model
         if self.before is not None:
             self.before = self.before.with_model(model)
         if self.observer is not None:
@@ -247,7 +254,7 @@ class Following:
                 x = state_after(model.transfer_function, np.array(self._u), y)
                 self.observer.place(x, True)
 
-    def is_of(self, place: Place) -> bool:
+    def _is_of(self, place: Place) -> bool:
         """Whether a place is one of this G."""
         own, of = self.model.transfer_function, place.model
         return of is own or (
@@ -290,15 +297,15 @@ class Following:
         newer: v and y of the samples since then (2, M). known: whether the fit explains all of its
         samples, so that it knows the state better than the newest of them do.
         """
+        follows = self._is_of(place)
         if self.observer is None:
-            self.observer = Observer(self.model, noise_std, None, self.gains)
+            self.observer = Observer(self.model, noise_std, None, place.gains if follows else None)
         else:
             self.observer.settle(noise_std)
         observer, gap, p = self.observer, estimate.c_r - estimate.c_l, place.p
         for remembered, values in ((self._u, place.u), (self._y, place.y)):
             remembered.clear()
             remembered.extend(values.tolist())
-        follows = self.is_of(place)
         if follows:
             observer.place(place.x, known)
         for v, y in newer.T.tolist():

@@ -45,7 +45,11 @@ class Family(Protocol):
         """See above."""
 
     def at(self, xi: list[float]) -> tuple[list[float], list[float]]:
-        """b and a of y(k) = sum b_i u(k-i) - sum a_i y(k-i), of one length."""
+        """b and a of y(k) = sum b_i u(k-i) - sum a_i y(k-i), of one length.
+
+        y(k) is the output after the interval over which u(k) acted, so that b_0 is what acts with
+        the smallest delay there is.
+        """
 
     def slopes(self, xi: list[float]) -> tuple[Array, Array]:
         """Derivatives of b and a by each xi, both of shape (K, n + 1)."""
@@ -100,11 +104,6 @@ class PlantFamily:
         self.memory = memory_of(slowest)
 
     def at(self, xi: list[float]) -> tuple[list[float], list[float]]:
-        """b and a of y(k) = sum b_i u(k-i) - sum a_i y(k-i), of one length.
-
-        y(k) is the output after the interval over which u(k) acted, so that b_0 is what acts with
-        the smallest delay there is.
-        """
         leak, lag, width, logs = self._moved(xi)
         stable = _product(*(section for section, _ in self._sections_at(logs)))
         gain, rest = sum(stable) / self._gain, self._rest([1.0, -1.0 + leak])
@@ -117,7 +116,6 @@ class PlantFamily:
         return b + [0.0] * (length - len(b)), a + [0.0] * (length - len(a))
 
     def slopes(self, xi: list[float]) -> tuple[Array, Array]:
-        """Derivatives of b and a by each xi, both of shape (K, n + 1)."""
         leak, lag, width, logs = self._moved(xi)
         sections = self._sections_at(logs)
         stable = _product(*(section for section, _ in sections))
