@@ -134,7 +134,7 @@ GAP, B, A = 0.3, [0.0, 0.05, 0.045], [1.0, -1.6, 0.695]
 
 def identify_jobs(scale: float) -> list[tuple[str, int]]:
     """Records of the lengths that users have."""
-    return repeated(scale, tuple(IDENTIFIED), 2)
+    return repeated(scale, tuple(IDENTIFIED), 3)  # fewer show no scatter
 
 
 def run_identify(job: tuple[str, int]) -> Times:
