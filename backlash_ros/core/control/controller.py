@@ -62,22 +62,16 @@ class AdaptiveController:
     ) -> ControlStep:
         """Learn from y(k), and return the command for sample k.
 
-        y, y_m: output and reference, finite. lost: samples that never arrived since the last
+        y, y_m: output and reference, finite. lost: samples >= 0 that never arrived since the last
         call; the plant went on with the last v through all of them. applied: the v that was
         really applied in each of the lost + 1 intervals since then, if it is known. commands: those
         that acted in them, if it is not the last one. alternatives: commands that may have acted
         instead, nan where none may.
         """
-        if lost < 0:
-            raise ValueError(f'lost={lost!r} must be >= 0')
         if not all(map(plausible, (y, y_m, *applied, *commands))):
             raise ValueError(
                 f'y={y!r}, y_m={y_m!r}, applied={applied!r} and commands={commands!r} must be '
                 f'finite and no larger than {LARGEST_SIGNAL:g}'
-            )
-        if any(values and len(values) != lost + 1 for values in (applied, alternatives, commands)):
-            raise ValueError(
-                f'applied, alternatives and commands must have lost + 1 = {lost + 1!r} values each'
             )
         if self._interval is not None:
             for i in range(lost + 1):
