@@ -112,7 +112,7 @@ def saturation(o: Observed) -> Figures:
               for width in (o.one_play.at[0], 0.0)
               for low, high in ((-1.0, 0.75), (0.25, 2.0), (0.2, 0.8), (0.35, 0.65))]
     found = family.best(ended, starts)
-    if not family.beats(found, o.one_play, o.noise, 0.95):  # a rounded play has an end too
+    if not family.beats(found, o.one_play, o.noise, 0.6):
         return None
     width, low, high = found.at
     p = family.play(width)
