@@ -204,10 +204,12 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
         numbers = frozenset((record.first + new + np.flatnonzero(wild)).tolist())
         cleaned = replace(before, rejected=before.rejected | numbers)
         return _known(setup, record.without(numbers), cleaned)
-    if _contradicts(problem, held, fit, new):
+    # What was known before the run is not to be moved by samples that the fit does not explain.
+    rho = held.correlation if before.inherited is None else 0.0
+    if _contradicts(problem, held, fit, new, rho):
         fit = problem.fitted(held)  # before anything is blamed
     grown = before.on_probation and fit.noise > settings.AS_GOOD * before.adopted_noise
-    if grown or _contradicts(problem, held, fit, new):
+    if grown or _contradicts(problem, held, fit, new, rho):
         beyond = np.nan_to_num((problem.residual(held)[new:] / held.noise) ** 2 - MISFIT)
         change = int(np.argmax(np.cumsum(beyond[::-1])[::-1]))
         return replace(
@@ -248,14 +250,16 @@ def _beside_others(setup: Setup, record: Window, problem: Problem, fit: WindowFi
     return replace(best, spread=spread(problem, best, [fit, other]))
 
 
-def _contradicts(problem: Problem, held: WindowFit, fit: WindowFit, new: int) -> bool:
+def _contradicts(
+    problem: Problem, held: WindowFit, fit: WindowFit, new: int, rho: float,
+) -> bool:
     """Whether the samples from `new` on contradict what was held, and `fit` that takes them in.
 
-    They do as well where it takes them in at the cost of all others.
+    They do as well where it takes them in at the cost of all others. rho: correlation of residuals.
     """
     weights = problem.weights(fit)
     z = problem.residual(fit) / held.noise
-    if float(np.nanmean(z**2)) > _most(settings.AS_GOOD**2, float(weights.sum()), held):
+    if float(np.nanmean(z**2)) > _most(settings.AS_GOOD**2, float(weights.sum()), rho):
         return True
     weights, z = weights[new:], z[new:]
     seen = np.isfinite(z)
@@ -264,15 +268,15 @@ def _contradicts(problem: Problem, held: WindowFit, fit: WindowFit, new: int) ->
         return False
     wild = np.abs(z) > settings.GATE
     mean = float(np.nansum(weights * np.where(wild, 0.0, z**2))) / count
-    return mean > _most(MISFIT, count, held) \
+    return mean > _most(MISFIT, count, rho) \
         or float(wild.sum()) > settings.OUTLIER_SHARE * int(seen.sum())
 
 
-def _most(least: float, count: float, held: WindowFit) -> float:
+def _most(least: float, count: float, rho: float) -> float:
     """Mean square of so many normalized residuals that is no chance: correlated ones are fewer."""
     from scipy.special import chdtri  # where fits are made: 31 MB
 
-    free = max(count / (1.0 + (count - 1.0) * held.correlation), 1.0)
+    free = max(count / (1.0 + (count - 1.0) * rho), 1.0)
     return max(least, float(chdtri(free, 1e-5)) / free)
 
 
