@@ -153,8 +153,7 @@ def _different(fits: list[WindowFit]) -> list[WindowFit]:
     """Fits without those that have come to the same gap as a likelier one."""
     out: list[WindowFit] = []
     for f in sorted(fits, key=lambda f: -f.evidence):
-        same = (abs(f.gap - g.gap) < 0.1 * sqrt(max(float(g.cov[2, 2]), 0.0)) for g in out)
-        if not any(same):
+        if all(abs(f.gap - g.gap) >= 0.1 * sqrt(max(float(g.cov[2, 2]), 0.0)) for g in out):
             out.append(f)
     return out
 

@@ -34,9 +34,7 @@ def search(
     family: Family, v: Array, y: Array, noise_std: float, widest: float, xi: Array,
     smallest: float = 0.01,
 ) -> tuple[list[Hypothesis], float]:
-    """Hypotheses, and the evidence of a u that never moves.
-
-    The likeliest one and those of other gaps that are likelier than their neighbours come first.
+    """Hypotheses, those likelier than with gaps beside theirs first, and the evidence of no motion.
 
     v, y: (N,), y nan where lost. widest: gap that is considered. xi: error of G (K,), around which
     G is linearized. smallest: gap that is compared, over the swing of v.
@@ -50,14 +48,10 @@ def search(
     found = [h for h in compared.evidence(gaps, starts) if isfinite(h.evidence)]
     if not found:
         return [], compared.null
-    first = sorted(_peaks(found), reverse=True)[:3]
-    return [*first, *sorted({*found} - {*first}, reverse=True)], compared.null
-
-
-def _peaks(found: list[Hypothesis]) -> list[Hypothesis]:
-    """Those of growing gaps that are likelier than their neighbours."""
     e = [-inf, *(h.evidence for h in found), -inf]
-    return [h for k, h in enumerate(found) if e[k] < e[k + 1] > e[k + 2]]
+    peaks = [h for k, h in enumerate(found) if e[k] < e[k + 1] > e[k + 2]]
+    first = sorted(peaks, reverse=True)[:3]
+    return [*first, *sorted({*found} - {*first}, reverse=True)], compared.null
 
 
 class _Comparison:
