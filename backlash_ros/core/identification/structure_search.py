@@ -226,7 +226,8 @@ def later(early: StructureSearch, options: Options, progress: Progress) -> Struc
     rows = effective(late.best.left)
     better = rows * log(max(best.rms, TINY) / max(late.best.rms, TINY)) + 0.5 * log(rows) * (
         best.structure.unknowns - late.best.structure.unknowns)
-    return late if late.best.structure.delay < max(late.delays) and better > 0.0 else early
+    # Very strong evidence (Kass and Raftery, J. Am. Stat. Assoc. 90 (1995) 773-795).
+    return late if late.best.structure.delay < max(late.delays) and better > 5.0 else early
 
 
 def observed_of(samples: Samples, best: Model, units: Units) -> Observed:
