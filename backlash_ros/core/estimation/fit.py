@@ -367,8 +367,7 @@ class Problem:
         e = np.add.reduceat((whole * w)[known], begins)  # of what counts as one reading
         squares = max(float(e @ e), 1e-300)
         rho = max(float(e[lag:] @ e[:-lag]) / squares for lag in (1, 2, 4, 8) if lag < len(e))
-        # As seldom by chance, in any of these lags, as once in a thousand fits.
-        rho = max(0.0, rho - 3.6 / sqrt(max(count, 1.0)))
+        rho = max(0.0, rho - 3.0 / sqrt(max(count, 1.0)))
         rho *= min(1.0, squares / max(count, 1.0))  # below the noise there may be anything
         return replace(
             f, evidence=float((log_density * w)[known].sum()) + f.volume, correlation=rho,
