@@ -203,8 +203,8 @@ def _no_gap(f: Findings, spread: float) -> Answer:
 def _gain(f: Findings) -> Answer:
     """Whether the gain of G at rest is known, and with it c_r + c_l."""
     if f.gain_std <= PRECISE:
-        return Answer(True, f'the gain of G is known to {f.gain_std:.2g} of itself')
-    much = f'to {f.gain_std:.0%} only' if f.gain_std < 1.0 else 'not at all'
+        return Answer(True, f'the gain of G is known to {100.0 * f.gain_std:.2g} %')
+    much = f'to {100.0 * f.gain_std:.2g} % only' if f.gain_std < 1.0 else 'not at all'
     return Answer(
         False, f'the gain of G at rest is known {much}, and with it the middle of the gap',
         'move v further and with rests, or record for longer; a y that drifts hides it',
@@ -220,13 +220,13 @@ def _model(f: Findings) -> Answer:
             'moved', 'move v further and with rests; a y that drifts hides it',
         )
     if spread <= PRECISE:
-        return Answer(True, f'G is known to {spread:.2g} of itself, good enough to start with')
+        return Answer(True, f'G is known to {100.0 * spread:.2g} %, good enough to start with')
     if spread <= 0.5:
         return Answer(
-            True, f'G is known to {spread:.0%}: good enough to start the controller with '
+            True, f'G is known to {100.0 * spread:.2g} %: good enough to start the controller with '
             'plant.uncertainty as in identified.yaml, which learns the rest',
         )
-    much = f'{spread:.0%} of itself' if spread < 1.0 else 'nothing'
+    much = f'{100.0 * spread:.2g} %' if spread < 1.0 else 'nothing'
     return Answer(False, f'G, where y moves, is known to {much}',
                   'move v at more speeds, record for longer, or limit --order')
 

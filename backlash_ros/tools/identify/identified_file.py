@@ -189,9 +189,9 @@ def commented_yaml(
     band, std = hertz(found), found.std
     comments = {
         'sample_period': 'of the record [s]',
-        'plant.numerator': f'G to ± {found.response_std.max():.2g} of itself from {band[0]:.2g} to '
+        'plant.numerator': f'G to ± {100.0 * found.response_std.max():.2g} % from {band[0]:.2g} to '
                            f'{band[-1]:.2g} Hz; its gain is that for m = {found.m:g}, ± '
-                           f'{std["m"] / found.m:.2g} of itself',
+                           f'{100.0 * std["m"] / found.m:.2g} %',
         'plant.denominator': f'{len(found.denominator) - 1} poles'
                              + (', one of them an integrator' if found.integrator else ''),
         'plant.uncertainty': 'twice the deviation of G, and 0.01 at least',

@@ -28,14 +28,14 @@ def test_a_gap_is_known_though_gain_and_middle_are_not() -> None:
     first, second = found.lines
     assert first.startswith('the gap is 0.6 ± 0.01; the gain of G at rest is known not at all')
     assert second == (
-        'G is known to 30%: good enough to start the controller with plant.uncertainty as in '
+        'G is known to 30 %: good enough to start the controller with plant.uncertainty as in '
         'identified.yaml, which learns the rest'
     )
     assert found.reasons == ()
 
 
 @pytest.mark.parametrize(('changed', 'said'), [
-    ({'response_std': 0.8}, 'G, where y moves, is known to 80% of itself'),
+    ({'response_std': 0.8}, 'G, where y moves, is known to 80 %'),
     ({'response_std': 8.0}, 'is known to nothing'),
     ({'c_r_std': 9.0}, 'the middle of the gap is known to ± 9 only'),
 ])
