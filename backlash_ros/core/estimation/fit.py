@@ -303,6 +303,10 @@ class Problem:
             # Far from the optimum the error of the linearization passes for one of G.
             most = 1.0 if k < far_steps < steps else np.inf
             new, there, value = self._stepped(f, best, weights, most)
+            if not value > best - 0.5:
+                # A kink where the play began bars the way to all else: held there, it does not.
+                other = self._stepped(f, best, weights, most, begun=True)
+                new, there, value = max((new, there, value), other, key=lambda one: one[2])
             if not value > best - 50.0:  # f stands: only its posterior is new, and its noise
                 f = replace(f, cov=new.cov, prior=new.prior, scale=new.scale, volume=new.volume)
                 noise_std = f.noise_std if f.step else self._noise_of(f)
@@ -319,16 +323,16 @@ class Problem:
         return f
 
     def _stepped(
-        self, f: WindowFit, best: float, weights: Array, most_scale: float,
+        self, f: WindowFit, best: float, weights: Array, most_scale: float, begun: bool = False,
     ) -> tuple[WindowFit, WindowFit, float]:
         """What a step leads to, where it goes as far as that helps, and its log-posterior."""
         shortest_step = 0.05  # share of a Gauss-Newton step that is tried
-        new = self.kept(self.step(f, most_scale))
+        new = self.kept(self.step(f, most_scale, begun=begun))
         there = _towards(f, new)
         value = self.log_posterior(there, weights)
         if -inf < value <= best - 0.5:
             # Beyond a kink of the play, where another side was engaged, it may be better.
-            again = _towards(there, self.kept(self.step(there, most_scale)))
+            again = _towards(there, self.kept(self.step(there, most_scale, begun=begun)))
             of_again = self.log_posterior(again, weights)
             if of_again > best:
                 there, value = again, of_again

@@ -9,6 +9,7 @@ from cases.geared_motor import motor
 from contract.judged import judged
 from contract.learning_rows import PAPER as EXACT
 from contract.learning_rows import Job, Outcome, changes_jobs, run_job
+from ordinary_motions import all_cases, run_case
 from scipy.special import chdtri
 
 from backlash_ros.core.control.controller import Limits
@@ -127,3 +128,10 @@ def test_a_bound_that_keeps_a_good_estimate_back_is_named_with_what_was_found(na
     assert found is not None
     assert (found.name, found.bound) == (name, bound)
     assert found.value == pytest.approx(value, rel=0.01)
+
+
+def test_a_slow_sine_with_g_known_is_never_tracked_wrongly() -> None:
+    # The search lets the play begin where it does not, and Gauss-Newton has to pass a kink.
+    (case,) = (one for one in all_cases([3]) if one.name == 'sine 0.5 rad/s; G known; 200 Hz')
+    found = run_case(case)
+    assert found.faults == []
