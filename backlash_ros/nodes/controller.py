@@ -219,7 +219,7 @@ class ControllerNode(ManagedNode):
             loops.end(self.settings.on_stop)
             self._send_last(loops)
             for joint in self.joints:
-                joint.model.publish(loops.by_name[joint.name])
+                joint.model.publish_last(loops.by_name[joint.name])
         self._rivals.begin(active=False)
         self._diagnose()
 

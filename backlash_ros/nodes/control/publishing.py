@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from itertools import cycle
 from math import inf, nan
 
+from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -159,6 +160,11 @@ class ModelPublisher:
         if learned is not told or (index - told_index) * sample_period_s >= 1.0:
             self._told = learned, index
             self.publish(loop)
+
+    def publish_last(self, loop: ControlLoop) -> None:
+        """Publish before the end, and wait until who listens has it: a recorder ends next."""
+        self.publish(loop)
+        self._publisher.wait_for_all_acked(Duration(seconds=1))
 
     def publish(self, loop: ControlLoop) -> None:
         """Publish at once."""
