@@ -71,7 +71,7 @@ class ControllerNode(ManagedNode):
                 self.log.warning(f'{joint}: {warning}' if joint else warning)
         self.loops: JointLoops | None = None  # None while unconfigured
         # A fit that shared the process of the loop would hold up its commands.
-        self._executor: Executor = (Executor() if p.lockstep else WorkerExecutor(WORKER_MODULES))
+        self._executor: Executor = Executor() if p.lockstep else WorkerExecutor(WORKER_MODULES)
         self._io = DriverIo(self, p)
         if not p.lockstep:
             # The first command begins with what the driver reports, even if it is not learned from.

@@ -287,7 +287,7 @@ def is_known(setup: Setup, f: WindowFit, turns: int) -> bool:
     deviations must be smaller: what causes that does not average out. A gap is also known where
     its upper end is small beside the first guess: there is none.
     """
-    return forbidden(setup, f, turns) is None and _is_precise(setup, f, turns)
+    return _is_precise(setup, f, turns) and not any(outside_bounds(setup.bounds, f))
 
 
 def forbidden(setup: Setup, f: WindowFit, turns: int) -> OutOfBounds | None:

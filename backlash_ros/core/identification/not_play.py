@@ -47,12 +47,6 @@ class Observed:
         return float(np.nanmax(self.y) - np.nanmin(self.y))
 
     @property
-    def along(self) -> float:
-        """Correlation of v and y: about 1 or -1, but next to 0 where G integrates."""
-        known = np.isfinite(self.y)
-        return float(np.corrcoef(self.v[known], self.y[known])[0, 1])
-
-    @property
     def unexplained(self) -> bool:
         """Whether the residual is more than noise."""
         left = float(np.sqrt(np.nanmean(self.residual**2)))
@@ -95,14 +89,16 @@ def saturation(o: Observed) -> Figures:
     family = o.family
     if family is None:
         return None
-    v, swing = family.v, float(np.ptp(family.v))
+    v, swing, known = family.v, float(np.ptp(family.v)), np.isfinite(o.y)
+    # About 1 or -1, but next to 0 where G integrates.
+    along = float(np.corrcoef(o.v[known], o.y[known])[0, 1])
     for end, way in ((np.nanpercentile(o.y, 98.0), 1.0), (np.nanpercentile(o.y, 2.0), -1.0)):
         within = 4.0 * o.noise + 0.005 * o.swing
         runs = _runs(np.abs(o.y - end) < within)
-        on = [float(np.max((o.v[run] - o.v[run[0]]) * way * np.sign(o.along))) for run in runs]
+        on = [float(np.max((o.v[run] - o.v[run[0]]) * way * np.sign(along))) for run in runs]
         # What would move y by far more, if it moved.
         far = max(0.1, 3.0 * within / o.swing) * swing
-        if abs(o.along) > 0.3 and sum(size > far for size in on) >= 3:
+        if abs(along) > 0.3 and sum(size > far for size in on) >= 3:
             return {'end': float(end), 'on': max(on)}
 
     def ended(width: float, low: float, high: float) -> Array:

@@ -17,6 +17,7 @@ from backlash_ros.core.plant.actuator import Actuator
 
 Array = NDArray[np.float64]
 
+
 @dataclass(frozen=True)
 class Options:
     """What is compared. delays [samples]: none for EARLY, and later ones where these fit better.

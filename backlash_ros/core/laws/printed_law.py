@@ -28,7 +28,7 @@ def printed_f(u: float, y_m: float, m: float, w: float) -> float:
 def printed_m(u: float, y_m: float, f: float, w: float) -> float:
     """m = M_n / M_d of (3.11); nan where M_d is 0."""
     numerator = u * y_m * f**2 + u * f**3 * w
-    denominator = (u * y_m * f + u * f**2 * w - y_m**2 * f - 2.0 * y_m * f**2 * w - f**3 * w**2)
+    denominator = u * y_m * f + u * f**2 * w - y_m**2 * f - 2.0 * y_m * f**2 * w - f**3 * w**2
     return numerator / denominator if denominator != 0.0 else nan
 
 

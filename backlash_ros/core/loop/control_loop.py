@@ -162,13 +162,13 @@ class ControlLoop:
 
     def skip(self, arrival: Arrival) -> None:
         """Leave a sample unanswered of which this loop has no output."""
-        if arrival.is_sample and self.phase is not Phase.STANDS_DOWN:
+        if arrival.is_sample and not self.standing_down:
             self._note_missing(arrival)
             self._note_missing(Arrival(True, missing=1), lost=False)
 
     def send(self, v: float) -> None:
         """Send a command and note when it left; nothing while another controller commands."""
-        if self.phase is Phase.STANDS_DOWN:
+        if self.standing_down:
             return
         if v != self.v:  # it is none of the core
             self.core.motion = Motion(v, v - self.v, v)
@@ -179,7 +179,7 @@ class ControlLoop:
     def _is_usable(self, output: Output, arrival: Arrival, y_m: float) -> bool:
         """Count a message of y; returns whether there is a command to be made of it."""
         statistics = self.statistics
-        if self.phase is Phase.STANDS_DOWN:
+        if self.standing_down:
             return False
         if not arrival.is_sample:
             statistics.extra += 1
@@ -212,7 +212,7 @@ class ControlLoop:
     def _may_answer(self, output: Output) -> bool:
         """Begin anew where too much is missing; returns whether a v to go on from is known."""
         p, gap = self._p, self._gap
-        if gap is not NEXT_SAMPLE or self.phase is Phase.SILENT:
+        if gap is not NEXT_SAMPLE or self.silent:
             too_long = gap.missing > LONGEST_GAP or (
                 not p.lockstep
                 and 0.0 < p.timeout.plant_output < gap.missing * p.sample_period
@@ -308,7 +308,7 @@ class ControlLoop:
 
     def hear_other(self, v: float) -> None:
         """Take in a command of the controller that is in charge."""
-        if self.phase is Phase.STANDS_DOWN and plausible(v):
+        if self.standing_down and plausible(v):
             self._go_on_from(v)
             self.commands.newest_ns = self._driver.now_ns()
 
