@@ -9,7 +9,7 @@ import os
 import signal
 import threading
 from collections.abc import Generator, Mapping, Sequence
-from concurrent.futures import CancelledError, ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, CancelledError, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from importlib.metadata import version
@@ -164,8 +164,12 @@ def _in_processes(jobs: Sequence[Job], workers: int) -> Generator[tuple[int, Out
             signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
         if held.count:
             raise KeyboardInterrupt
-        for future in as_completed(numbers):
-            yield numbers[future], future.result()
+        pending = set(numbers)
+        while pending:
+            # A signal that comes just before a wait is only noticed after it: none is without end.
+            done, pending = wait(pending, 0.5, FIRST_COMPLETED)
+            for future in done:
+                yield numbers[future], future.result()
     except BrokenProcessPool:
         raise BrokenOffError('a worker process was killed: is there enough memory?') from None
     finally:
