@@ -15,10 +15,9 @@ import json
 import os
 import re
 import sys
-import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from math import pi
 from pathlib import Path
 
@@ -26,18 +25,17 @@ from pathlib import Path
 os.environ.setdefault('OMP_NUM_THREADS', '1')
 
 import numpy as np
-from cases.geared_motor import motor, random_backlash
+from cases.geared_motor import load_model, motor, random_backlash
+from cases.reference_loop import NINE_DIGITS, loop_on
 from contract.figures import Figure, by_group, figure, rms, share, upper
-from contract.judged import FAR, Judged, judged
+from contract.judged import FAR, judged
 from numpy.typing import NDArray
 from reporting import ROOT, parallel, text_table
-from scipy.signal import cont2discrete
 
-from backlash_ros.core import Parameters, Status, build_closed_loop
+from backlash_ros.core import Status
 
 Array = NDArray[np.float64]
 
-CORNER, DAMPING = 2.0 * pi * 20.0, 0.5  # of the load in config/geared_motor.yaml [rad/s]
 AMPLITUDE = 0.5  # of y_m [rad]
 FIVE_PERIODS = 10  # reversals
 IN_TIME = 6  # reversals within which *tracking* is due
@@ -181,16 +179,16 @@ class Result:
     plant: str
     rate: float
     seed: int
-    learned: int | None
-    first: int | None
-    first_s: float | None
-    at_five: float
-    std_five: float | None
-    rms: float | None
-    beyond: float | None
-    wrong: float | None
-    shares: Mapping[str, float]
-    ms: float
+    learned: int | None = None
+    first: int | None = None
+    first_s: float | None = None
+    at_five: float = 1e9
+    std_five: float | None = None
+    rms: float | None = None
+    beyond: float | None = None
+    wrong: float | None = None
+    shares: Mapping[str, float] = field(default_factory=dict)
+    ms: float = 0.0
     problem: str = ''
 
     @property
@@ -269,44 +267,27 @@ def random_cases(count: int, seed: int, samples: int) -> Iterator[Case]:
 
 def run_case(case: Case) -> Result:
     """Simulate; a run that breaks off is a result as well."""
-    period = 1.0 / case.rate
+    period, key = 1.0 / case.rate, (case.motion, case.plant, case.rate, case.seed)
     backlash = random_backlash(case.seed)
-    gap = backlash['backlash.c_r'] - backlash['backlash.c_l']
-    lost_motion = backlash['backlash.m'] * gap
-    rng = np.random.default_rng([case.seed, 13])
-    y_m = case.shape(rng, period, lost_motion)
-    numerator, denominator, _ = cont2discrete(
-        ([CORNER**2], [1.0, 2.0 * DAMPING * CORNER, CORNER**2]), period)
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / 'y_m.csv'
-        rows = (f'{k * period:.6f},{value:.9g}' for k, value in enumerate(y_m))
-        file.write_text('\n'.join(['t,y_m', *rows]))
-        p = Parameters({
-            **motor(), **backlash, **case.differs, 'seed': case.seed,
-            'sample_period': period, 'plant.numerator': numerator[0, 1:].tolist(),
-            'plant.denominator': denominator.tolist(), 'waveform': 'file', 'file': str(file),
-            # A way that is longer than that of the example.
-            'control.min': -1e4, 'control.max': 1e4,
-        })
-        loop = build_closed_loop(p)
+    lost_motion = backlash['backlash.m'] * (backlash['backlash.c_r'] - backlash['backlash.c_l'])
+    y_m = case.shape(np.random.default_rng([case.seed, 13]), period, lost_motion)
+    numerator, denominator = load_model(period)
+    loop = loop_on({
+        **motor(), **backlash, **case.differs, 'seed': case.seed,
+        'sample_period': period, 'plant.numerator': numerator, 'plant.denominator': denominator,
+        # A way that is longer than that of the example.
+        'control.min': -1e4, 'control.max': 1e4,
+    }, y_m, NINE_DIGITS)
     began = time.process_time()
     try:
-        run = loop.run(len(y_m))
+        record = loop.run(len(y_m))
     except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
-        return Result(*_key(case), None, None, None, 1e9, None, None, None, None, {}, 0.0,
-                      f'broke off: {error}')
+        return Result(*key, problem=f'broke off: {error}')
     ms = 1e3 * (time.process_time() - began) / len(y_m)
     # A constant that is added to u moves both crossings.
-    found = judged(run, p.input_disturbance / backlash['backlash.m'])
-    return _result(case, y_m, found, ms)
-
-
-def _key(case: Case) -> tuple[str, str, float, int]:
-    return case.motion, case.plant, case.rate, case.seed
-
-
-def _result(case: Case, y_m: Array, run: Judged, ms: float) -> Result:
-    reversals, tracking, omega = reversals_of(y_m), run.tracking, case.shape.omega
+    offset = float(str(case.differs.get('input_disturbance', 0.0)))
+    run = judged(record, offset / backlash['backlash.m'])
+    reversals, omega = reversals_of(y_m), case.shape.omega
     five = int(np.argmax(reversals >= FIVE_PERIODS)) or len(y_m) - 1
     if omega:
         five = min(round(5 * 2 * pi * case.rate / omega), len(y_m) - 1)
@@ -315,9 +296,9 @@ def _result(case: Case, y_m: Array, run: Judged, ms: float) -> Result:
     def first(rows: NDArray[np.bool_]) -> int | None:
         return int(np.argmax(rows)) if rows.any() else None
 
-    learned, begun = first(tracking & (run.error <= FAR)), first(tracking)
+    learned, begun = first(run.tracking & (run.error <= FAR)), first(run.tracking)
     return Result(
-        *_key(case), None if learned is None else int(reversals[learned]),
+        *key, None if learned is None else int(reversals[learned]),
         None if begun is None else int(reversals[begun]),
         None if begun is None else begun / case.rate, float(run.error[five]),
         std if np.isfinite(std) else None, run.rms, run.beyond, run.wrong_if_tracking,

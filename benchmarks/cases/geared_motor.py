@@ -1,14 +1,16 @@
-"""Parameters of config/geared_motor.yaml, and random backlashes for it."""
+"""Parameters of config/geared_motor.yaml, its load at other rates, random backlashes for it."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import lru_cache
+from math import pi
 from typing import Any
 
 import numpy as np
 import yaml
 from reporting import ROOT
+from scipy.signal import cont2discrete
 
 
 def flat(sections: Mapping[str, Any]) -> dict[str, Any]:
@@ -39,3 +41,10 @@ def random_backlash(seed: int) -> dict[str, float]:
     gap, share = rng.uniform(0.2, 2.0), rng.uniform(0.2, 0.8)
     return {'backlash.m': float(rng.uniform(0.06, 0.15)), 'backlash.c_r': float(gap * share),
             'backlash.c_l': float(gap * (share - 1.0))}
+
+
+def load_model(period_s: float) -> tuple[list[float], list[float]]:
+    """Numerator, without the delay of one sample, and denominator of its load at a period."""
+    corner, damping = 2.0 * pi * 20.0, 0.5
+    b, a, _ = cont2discrete(([corner**2], [1.0, 2.0 * damping * corner, corner**2]), period_s)
+    return b[0, 1:].tolist(), a.tolist()

@@ -13,21 +13,20 @@ from math import pi
 from typing import Any, NamedTuple
 
 import numpy as np
-from cases.geared_motor import motor
+from cases.geared_motor import load_model, motor
+from cases.reference_loop import loop_on, without_sensor
 from numpy.typing import NDArray
-from scipy.signal import cont2discrete, lfilter, sawtooth
+from scipy.signal import sawtooth
 
-from backlash_ros.core import Parameters, Status, build_closed_loop
+from backlash_ros.core import Parameters, Status
 from backlash_ros.core.plant.simulated_plant import altered_plant
 from backlash_ros.core.plant.transfer_function import TransferFunction
-from backlash_ros.core.reference.signal import ReferenceSignal
 from backlash_ros.core.simulation.metrics import turns
 from backlash_ros.core.simulation.run_record import RunRecord
 from contract.figures import Figure, by_group, figure, rms, share, upper
 
 Array = NDArray[np.float64]
 
-CORNER, DAMPING = 2.0 * pi * 20.0, 0.5  # of the load in config/geared_motor.yaml [rad/s]
 LONGEST_S, MOST_SAMPLES = 40.0, 5000
 LEAST_TURN = 0.01  # share of m gap by which u* turns at least
 MOTIONS = ('sine', 'triangle', 'steps', 'moves')
@@ -35,16 +34,14 @@ CONSTANTS = ('exact', '3 % off', 'learned')
 
 
 class Crossing(NamedTuple):
-    """One loop. crossings, allowed: of the gap by v. error: RMS of y - y_m over that of a loop
-    without backlash in the same noise.
+    """One loop: crossings of the gap by v over those allowed, and RMS of y - y_m over that of a
+    loop without backlash in the same noise. drawn: what the case is.
     """
 
     group: str
-    crossings: int
-    allowed: float
+    crossings: float
     error: float
-    gapless: float
-    case: dict[str, Any]
+    drawn: dict[str, Any]
 
 
 def crossing_jobs(scale: float, first_seed: int = 0) -> list[int]:
@@ -72,19 +69,16 @@ def case_of(seed: int) -> tuple[dict[str, Any], Array, Array, dict[str, Any]]:
     constants = CONSTANTS[seed // 8 % 3]
     period_s = float(1.0 / np.exp(rng.uniform(np.log(50.0), np.log(1000.0))))
     omega = float(np.exp(rng.uniform(np.log(0.4), np.log(10.0))))
+    values: dict[str, Any] = {**motor()} if plant == 'motor' else {}
     if plant == 'motor':
-        values = {**motor()}
-        b, a, _ = cont2discrete(
-            ([CORNER**2], [1.0, 2.0 * DAMPING * CORNER, CORNER**2]), period_s)
-        model = TransferFunction(np.trim_zeros(b[0], 'f').tolist(), a.tolist())
+        model = TransferFunction(*load_model(period_s))
     else:
-        values = {}
         paper = Parameters({}).plant
         model = altered_plant(
             TransferFunction(paper.numerator, paper.denominator), period_s / 0.01)
     values |= {'sample_period': period_s, 'plant.numerator': model.numerator.tolist()[1:],
                'plant.denominator': model.denominator.tolist(), 'structure': 'tracking',
-               'seed': seed, 'output_quantum': values.get('output_quantum', 0.0)}
+               'seed': seed, 'amplitude': 1.0, 'bias': 0.0}
     hidden = Parameters(values).backlash
     gain = float(abs(model.response(np.array([np.exp(1j * omega * period_s)]))[0]))
     of_gap = gain * hidden.m * (hidden.c_r - hidden.c_l)
@@ -118,49 +112,40 @@ def case_of(seed: int) -> tuple[dict[str, Any], Array, Array, dict[str, Any]]:
     return values, wanted, heard, drawn
 
 
-def run_loop(values: dict[str, Any], y_m: Array) -> tuple[RunRecord, Array, int]:
-    """The run, y before the sensor and the delay."""
-    p = Parameters(values)
-    loop = build_closed_loop(p)
-    signal = Parameters({**values, 'waveform': 'file', 'amplitude': 1.0, 'bias': 0.0})
-    loop.reference = ReferenceSignal(signal, tuple(y_m.tolist()))
-    run = loop.run(len(y_m))
-    b, a = np.array(p.plant.numerator), np.array(p.plant.denominator)
-    y = lfilter(np.append(np.zeros(len(a) - len(b)), b), a, run.column('u'))
-    return run, np.asarray(y), loop.controller.structure.delay
-
-
 def run_crossing(seed: int) -> Crossing:
     """The loop, and those without backlash."""
     values, wanted, heard, drawn = case_of(seed)
+    p = Parameters(values)
     gapless = {**values, 'estimator.law': 'fixed', 'fixed.doubt': 0.0,
-               'estimator.initial.m': Parameters(values).backlash.m,
+               'estimator.initial.m': p.backlash.m,
                'estimator.initial.c_r': 0.0, 'estimator.initial.c_l': 0.0,
                'backlash.c_r': 1e-9, 'backlash.c_l': -1e-9, 'backlash.initial_u': 0.0}
-    ideal = run_loop(
-        {**gapless, 'output_noise_std': 0.0, 'output_quantum': 0.0}, wanted)[0].column('u_d')
-    (run, y, delay), (_, y_gapless, _) = run_loop(values, heard), run_loop(gapless, heard)
-    begin = delay
+    ideal = loop_on({**gapless, 'output_noise_std': 0.0, 'output_quantum': 0.0}, wanted) \
+        .run(len(wanted)).column('u_d')
+    loop = loop_on(values, heard)
+    run, beside = loop.run(len(heard)), loop_on(gapless, heard).run(len(heard))
+    begin = delay = loop.controller.structure.delay
+    count = len(wanted)
     if drawn['constants'] == 'learned':
         known = np.flatnonzero(run.column('status') == int(Status.TRACKING))
-        begin += (known[0] if len(known) else len(y) // 2) + 100
-    begin = min(begin, 3 * len(y) // 4)
+        begin += (known[0] if len(known) else count // 2) + 100
+    begin = min(begin, 3 * count // 4)
     gap = float(run.column('true_c_r')[0] - run.column('true_c_l')[0])
-    due = wanted[begin - delay:len(y) - delay]
-    allowed = (turns(ideal[begin:], LEAST_TURN * Parameters(values).backlash.m * gap) + 1.0
-               + (len(y) - begin) * run.sample_period / 10.0)
-    return Crossing(
-        drawn['motion'], turns(run.column('v')[begin:], 0.5 * gap), allowed,
-        rms(y[begin:] - due) / rms(due), rms(y_gapless[begin:] - due) / rms(due),
-        drawn,
-    )
+    allowed = (turns(ideal[begin:], LEAST_TURN * p.backlash.m * gap) + 1.0
+               + (count - begin) * run.sample_period / 10.0)
+
+    def error(of: RunRecord) -> float:
+        return rms(without_sensor(p, of)[begin:] - wanted[begin - delay:count - delay])
+
+    return Crossing(drawn['motion'], turns(run.column('v')[begin:], 0.5 * gap) / allowed,
+                    error(run) / error(beside), drawn)
 
 
 def crossing_figures(found: Sequence[Crossing]) -> dict[str, Figure]:
     """Figures of every motion."""
     return by_group(found, lambda of: {
-        'more crossings than allowed': share([one.crossings > one.allowed for one in of]),
-        'crossings / allowed, median': figure([one.crossings / one.allowed for one in of]),
-        'crossings / allowed, 90 %': figure([one.crossings / one.allowed for one in of], upper),
-        'error / without backlash, median': figure([one.error / one.gapless for one in of]),
+        'more crossings than allowed': share([one.crossings > 1.0 for one in of]),
+        'crossings / allowed, median': figure([one.crossings for one in of]),
+        'crossings / allowed, 90 %': figure([one.crossings for one in of], upper),
+        'error / without backlash, median': figure([one.error for one in of]),
     })

@@ -7,17 +7,15 @@ uncompensated, slope known and gap taken as 0.
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping, Sequence
 from math import pi
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from cases.geared_motor import motor
 from cases.random_cases import random_case
+from cases.reference_loop import NINE_DIGITS, loop_on, without_sensor
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from backlash_ros.core import Parameters, build_closed_loop
 from backlash_ros.core.simulation.metrics import gap_crossings_per_reversal
@@ -56,11 +54,6 @@ class Followed(NamedTuple):
     peak: float
 
     @property
-    def over_gapless(self) -> float:
-        """1 for a loop that the backlash costs nothing."""
-        return min(self.adaptive / max(self.gapless, 1e-12), 1e3)
-
-    @property
     def cancelled(self) -> bool:
         """Whether no more than a tenth of what the backlash costs is left, or it costs nothing."""
         left, cost = self.adaptive - self.gapless, self.plain - self.gapless
@@ -87,12 +80,10 @@ def following_jobs(scale: float) -> list[Case]:
                  6000, tuple(0.5 * np.sin(0.0025 * np.arange(6000))
                              + 1e-4 * np.random.default_rng(seed).standard_normal(6000))),
         ]
-    for seed in range(round(40 * scale)):
-        case = random_case(seed)
+    for case in map(random_case, range(round(40 * scale))):
         p = case.parameters
         z = np.exp(1j * p.frequency * p.sample_period)
-        gain = abs(np.polyval(p.plant.numerator, z)
-                   / np.polyval(p.plant.denominator, z))
+        gain = abs(np.polyval(p.plant.numerator, z) / np.polyval(p.plant.denominator, z))
         # A reference of the estimation for y.
         cases.append(Case('random', {**p, 'structure': 'tracking',
                                      'amplitude': float(gain) * p.amplitude},
@@ -102,15 +93,14 @@ def following_jobs(scale: float) -> list[Case]:
 
 def run_following(case: Case) -> Followed:
     """Run the three loops."""
-    m = float(Parameters(case.changes)['backlash.m'])  # type: ignore[arg-type]
-    known = {'estimator.law': 'fixed', 'estimator.initial.m': m, 'estimator.initial.c_r': 0.0,
-             'estimator.initial.c_l': 0.0}
-    loops: list[Mapping[str, Any]] = [
-        {}, {**known, **NO_GAP, 'fixed.doubt': 0.0}, {**known, 'fixed.doubt': 0.5}]
-    runs = [_run(case, change) for change in loops]
-    if runs[0] is None or runs[1] is None or runs[2] is None:
+    known = {'estimator.law': 'fixed', 'estimator.initial.c_r': 0.0, 'estimator.initial.c_l': 0.0,
+             'estimator.initial.m': Parameters(case.changes).backlash.m}
+    try:
+        (adaptive, run, y), (gapless, _, _), (plain, _, y_plain) = (
+            _run(case, change) for change in (
+                {}, {**known, **NO_GAP, 'fixed.doubt': 0.0}, {**known, 'fixed.doubt': 0.5}))
+    except (ValueError, ArithmeticError, np.linalg.LinAlgError):
         return Followed(case.group, 1e3, 1.0, 1.0, None, 1.0, 1e3)
-    (adaptive, run, y), (gapless, _, _), (plain, _, y_plain) = runs
     v = run.column('v')
     return Followed(
         case.group, adaptive, gapless, plain, gap_crossings_per_reversal(run, SETTLED_S),
@@ -119,39 +109,31 @@ def run_following(case: Case) -> Followed:
     )
 
 
-def _run(case: Case, change: Mapping[str, Any]) -> tuple[float, Any, Array] | None:
-    """Error, run, y before the sensor; None for a run that breaks off."""
-    with tempfile.TemporaryDirectory() as folder:
-        values = {**case.changes, **change}
-        if case.y_m:
-            file = Path(folder) / 'y_m.csv'
-            period = Parameters(values).sample_period
-            rows = (f'{k * period:.6f},{value:.9g}' for k, value in enumerate(case.y_m))
-            file.write_text('\n'.join(['t,y_m', *rows]))
-            values |= {'waveform': 'file', 'file': str(file)}
-        p = Parameters(values)
-        loop = build_closed_loop(p)
-    try:
-        with np.errstate(over='ignore', invalid='ignore'):
-            run = loop.run(case.samples)
-    except (ValueError, ArithmeticError, np.linalg.LinAlgError):
-        return None
-    b, a = np.array(p.plant.numerator), np.array(p.plant.denominator)
-    y = lfilter(np.append(np.zeros(len(a) - len(b)), b), a, run.column('u'))
-    delay, begin = p.tracking.preview, round(SETTLED_S / p.sample_period)
-    begin = min(max(begin, delay), case.samples // 2)
+def _run(case: Case, change: Mapping[str, Any]) -> tuple[float, Any, Array]:
+    """Error, run, y before the sensor."""
+    values = {**case.changes, **change}
+    p = Parameters(values)
+    loop = loop_on(values, case.y_m, NINE_DIGITS) if case.y_m else build_closed_loop(p)
+    with np.errstate(over='ignore', invalid='ignore'):
+        run = loop.run(case.samples)
+    y, delay = without_sensor(p, run), p.tracking.preview
+    begin = min(max(round(SETTLED_S / p.sample_period), delay), case.samples // 2)
     wanted = run.column('y_m')[begin - delay:case.samples - delay]
-    return min(rms(y[begin:] - wanted) / max(rms(wanted), 1e-12), 1e3), run, np.asarray(y)
+    return min(rms(y[begin:] - wanted) / max(rms(wanted), 1e-12), 1e3), run, y
 
 
 def following_figures(found: Sequence[Followed]) -> dict[str, Figure]:
     """Figures of every reference."""
-    return by_group(found, lambda of: {
-        'error / without backlash, median': figure([f.over_gapless for f in of]),
-        'error / without backlash, 90 %': figure([f.over_gapless for f in of], upper),
-        'a tenth of the cost left, or less': share([f.cancelled for f in of], 'more'),
-        'crossings of the gap for each reversal': figure([f.crossings for f in of]),
-        'largest |y| / uncompensated': figure([f.peak for f in of]),
-        **({'share of samples in which v moves': share([f.moves for f in of])}
-           if of[0].group == 'rest' else {}),
-    })
+    def of_group(of: Sequence[Followed]) -> dict[str, Figure]:
+        over_gapless = [min(f.adaptive / max(f.gapless, 1e-12), 1e3) for f in of]
+        return {
+            'error / without backlash, median': figure(over_gapless),
+            'error / without backlash, 90 %': figure(over_gapless, upper),
+            'a tenth of the cost left, or less': share([f.cancelled for f in of], 'more'),
+            'crossings of the gap for each reversal': figure([f.crossings for f in of]),
+            'largest |y| / uncompensated': figure([f.peak for f in of]),
+            **({'share of samples in which v moves': share([f.moves for f in of])}
+               if of[0].group == 'rest' else {}),
+        }
+
+    return by_group(found, of_group)

@@ -8,9 +8,6 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
-# Before rclpy reads it.
-os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-
 import numpy as np
 from reporting import Check
 from std_msgs.msg import Float64
@@ -36,9 +33,9 @@ class Driver(MeasuringNode):
         self._plant, self._v = build_plant(parameters), 0.0
         self._period_s = parameters.sample_period
         self.first_command_at = np.nan
-        self._y = self._node.create_publisher(Float64, topics.PLANT_OUTPUT, 10)
-        self._number = self._node.create_publisher(Float64, 'echo/in', 10)
-        self._node.create_subscription(Float64, topics.CONTROL, self._take, 10)
+        self._y = self.node.create_publisher(Float64, topics.PLANT_OUTPUT, 10)
+        self._number = self.node.create_publisher(Float64, 'echo/in', 10)
+        self.node.create_subscription(Float64, topics.CONTROL, self._take, 10)
 
     def _take(self, message: Float64) -> None:
         self._v = message.data
@@ -53,7 +50,7 @@ class Driver(MeasuringNode):
             self._number.publish(Float64(data=self._v))
             next_s = max(next_s + self._period_s, time.perf_counter())
             while (left := next_s - time.perf_counter()) > 0.0:
-                self._executor.serve_urgent(int(1e9 * left))
+                self.executor.serve_urgent(int(1e9 * left))
             self._plant.step(self._v)
 
     def wait_for_command(self) -> float:

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-
-# Before rclpy reads it.
-os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 
 import numpy as np
 import rclpy
@@ -80,7 +76,7 @@ class Driver(MeasuringNode):
         self._v = self._v_before = 0.0
         self._v_came_at = 0.0
         self._answered_at: float | None = None
-        node = self._node
+        node = self.node
         self._y_m = node.create_publisher(Float64, topics.REFERENCE, 1)
         self._y = node.create_publisher(Float64, topics.PLANT_OUTPUT, 1)
         self._question = node.create_publisher(Float64, 'echo/in', 1)
@@ -106,11 +102,8 @@ class Driver(MeasuringNode):
 
     def connect(self) -> None:
         """Return once everybody is heard and the controller has a reference."""
-        deadline = time.monotonic() + DEADLINE_S
-        while not self._connected():
-            if time.monotonic() > deadline:
-                raise RuntimeError(f'the nodes were not there within {DEADLINE_S:g} s')
-            self._executor.spin_once(timeout_sec=0.01)
+        if not self.wait_for(self._connected, DEADLINE_S):
+            raise RuntimeError(f'the nodes were not there within {DEADLINE_S:g} s')
 
     def _ask(self, publisher: rclpy.publisher.Publisher, value: float) -> float | None:
         message = Float64(data=value)
@@ -118,7 +111,7 @@ class Driver(MeasuringNode):
         start = time.perf_counter()
         publisher.publish(message)
         while self._answered_at is None:
-            self._executor.serve_urgent(int(1e9 * PATIENCE_S))
+            self.executor.serve_urgent(int(1e9 * PATIENCE_S))
             if self._answered_at is None and time.perf_counter() - start > PATIENCE_S:
                 return None
         return self._answered_at - start
