@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from backlash_ros.core.records.record import RecordError, seconds
 
 Array = NDArray[np.float64]
-Rows = NDArray[np.intp]
 
 
 def in_seconds(
@@ -28,33 +27,34 @@ def in_seconds(
         return np.asarray(period * np.arange(count, dtype=float))
     t = np.where(np.isfinite(t), t, np.nan)
     unit_s = unit_s or _guessed_unit(known, period, said)
-    for around in (2.0**16, 2.0**32, 86400.0 / unit_s, 43200.0 / unit_s, 3600.0 / unit_s):
+    # A clock of 16 or 32 bits, of a day, half a day, an hour.
+    for around in (2.0**16, 2.0**32, *(hours * 3600.0 / unit_s for hours in (24.0, 12.0, 1.0))):
         falls = np.diff(t, prepend=t[0]) < -0.5 * around
-        if 0 < falls.sum() < 0.1 * count:
-            counted = t + around * np.cumsum(falls)
-            steps = np.diff(counted)[falls[1:]]
-            if ((steps >= 0.0) & (steps <= 3.0 * typical_step(known))).all():
-                said.append(f't begins anew after {seconds(around * unit_s)}: counted on')
-                t = counted
-                break
+        counted = t + around * np.cumsum(falls)
+        steps = np.diff(counted)[falls[1:]]
+        if 0 < len(steps) < 0.1 * count and (
+                (steps >= 0.0) & (steps <= 3.0 * typical_step(known))).all():
+            said.append(f't begins anew after {seconds(around * unit_s)}: counted on')
+            t = counted
+            break
     # Exact differences of numbers that hardly fit.
     return np.asarray((t - np.median(known)) * unit_s)
 
 
 def _guessed_unit(known: Array, period: float | None, said: list[str]) -> float:
     """Unit [s] of stamps of which nothing else tells it."""
-    epochs = (1e17, 1e-9, 'ns'), (1e14, 1e-6, 'µs'), (1e11, 1e-3, 'ms')  # stamps of this century
-    for least, scale, unit in epochs:
-        if np.median(np.abs(known)) > least:
+    size = np.median(np.abs(known))
+    for least, scale, unit in (1e17, 1e-9, 'ns'), (1e14, 1e-6, 'µs'), (1e11, 1e-3, 'ms'):
+        if size > least:  # in this century
             said.append(f't counts {unit} since 1970')
             return scale
     step = typical_step(known if known[-1] > known[0] else known[::-1])
-    whole = bool((known == np.round(known)).all())
+    whole = step >= 1.0 and bool((known == np.round(known)).all())
+    # Seconds since 1970, of dates as well, speak for themselves.
+    if period is None and whole and size < 1e9:
+        said.append('t, in whole numbers, is taken as seconds; if it counts something else: '
+                    '--period')
     if period is None:
-        # Seconds since 1970, of dates as well, speak for themselves.
-        if whole and step >= 1.0 and np.median(np.abs(known)) < 1e9:
-            said.append('t, in whole numbers, is taken as seconds; if it counts something else: '
-                        '--period')
         return 1.0
     for scale in (1e-3, 1e-6, 1e-9, 60.0):
         if abs(step * scale / period - 1.0) < 0.3:
@@ -69,13 +69,12 @@ def _guessed_unit(known: Array, period: float | None, said: list[str]) -> float:
 def typical_step(t: Array) -> float:
     """Median of the steps of t (N,) that go forward; raises RecordError where there is none."""
     steps = np.diff(t)
-    forward = steps[steps > 0.0]
-    if not len(forward):
+    if not (steps > 0.0).any():
         raise RecordError('t does not rise: give --period S, the time from row to row')
-    return float(np.median(forward))
+    return float(np.median(steps[steps > 0.0]))
 
 
-def in_order(t: Array, said: list[str], what: str = 'row') -> Rows:
+def in_order(t: Array, said: list[str], what: str = 'row') -> NDArray[np.intp]:
     """Rows of the stamps t (N,) [s] that are kept, by time.
 
     what: name of a row in said, to which is added what was done. Raises RecordError where the
@@ -84,9 +83,10 @@ def in_order(t: Array, said: list[str], what: str = 'row') -> Rows:
     def count(number: int, of: str = what) -> str:
         return f'{number} {of}{"" if number == 1 else "s"}'
 
-    def refused(why: str) -> RecordError:
-        return RecordError(f't {why}: choose another column for t with --columns, or leave t out '
-                           'and give --period S')
+    def refuse(wrong: int, most: float, why: str) -> None:
+        if wrong > most * len(rows):
+            raise RecordError(f't {why} {wrong} of {len(rows)} {what}s: choose another column for '
+                              't with --columns, or leave t out and give --period S')
 
     rows = np.flatnonzero(np.isfinite(t))
     if len(rows) < len(t):
@@ -97,24 +97,25 @@ def in_order(t: Array, said: list[str], what: str = 'row') -> Rows:
     if np.count_nonzero(steps < 0.0) > np.count_nonzero(steps > 0.0):
         rows = rows[::-1]
         said.append(f'the newest {what} stood first: turned around')
-    bad = _far_off(t[rows])
-    if np.mean(bad) > 0.1:
-        raise refused(f'jumps to and fro in {bad.sum()} of {len(rows)} {what}s')
+    # Far from the rows around, of which up to five in a row may be bad.
+    size = min(11, len(rows) - 1 + len(rows) % 2)
+    around = np.lib.stride_tricks.sliding_window_view(
+        np.pad(t[rows], size // 2, 'reflect'), size)
+    bad = np.abs(t[rows] - np.median(around, axis=1)) > 50.0 * typical_step(t[rows])
+    refuse(int(bad.sum()), 0.1, 'jumps to and fro in')
     if bad.any():
         said.append(f'{count(int(bad.sum()))} with a stamp far off left out')
         rows = rows[~bad]
     # A clock that began anew falls back by several periods; less is disorder.
     parts = np.split(rows, np.flatnonzero(np.diff(t[rows]) < -3.0 * typical_step(t[rows])) + 1)
+    longest = max(parts, key=len)
+    refuse(len(rows) - len(longest), 0.8, 'falls back and leaves out')
     if len(parts) > 1:
-        kept = max(parts, key=len)
-        if len(kept) < 0.2 * len(rows):
-            raise refused(f'falls back {len(parts) - 1} times')
+        rows = longest
         said.append(f't begins anew {count(len(parts) - 1, "time")}: the longest of {len(parts)} '
-                    f'parts, {len(kept)} {what}s, is used')
-        rows = kept
+                    f'parts, {len(rows)} {what}s, is used')
     moved = int(np.count_nonzero(np.diff(t[rows]) < 0.0))
-    if moved > 0.2 * len(rows):
-        raise refused(f'falls back in {moved} of {len(rows)} {what}s')
+    refuse(moved, 0.2, 'falls back in')
     if moved:
         rows = rows[np.argsort(t[rows], kind='stable')]
         said.append(f'{count(moved)} out of order sorted by time')
@@ -128,27 +129,17 @@ def spread_evenly(t: Array, said: list[str], *signals: Array) -> Array:
     else the same readings were written again, and the stamps stay.
     """
     begins = np.flatnonzero(np.diff(t, prepend=-np.inf) > 0.0)
-    lengths, spans = np.diff(begins), np.diff(t[begins])
-    if len(lengths) < 3 or np.median(lengths) < 2.0:
+    lengths, starts = np.diff(begins, append=len(t)), t[begins]
+    if len(lengths) < 4 or np.median(lengths[:-1]) < 2.0:
         return t
     within = np.diff(t) == 0.0
-    for signal in signals:
-        moves = np.abs(np.diff(signal))
+    for moves in (np.abs(np.diff(signal)) for signal in signals):
         known = np.isfinite(moves)
         of_run, between = moves[within & known], moves[~within & known]
         if not len(of_run) or not len(between) or of_run.mean() <= 0.5 * between.mean():
             return t
-    period = float(np.median(spans[1:] / lengths[1:]))
+    period = float(np.median(np.diff(starts)[1:] / lengths[1:-1]))
     # The first run may have begun before the log did; a pause is between two runs.
-    starts = t[begins]
-    starts[0] += spans[0] - period * lengths[0]
-    run = np.repeat(np.arange(len(begins)), np.diff(np.append(begins, len(t))))
-    said.append(f'up to {lengths.max()} rows share a stamp, and move: spread evenly')
-    return np.asarray(starts[run] + period * (np.arange(len(t)) - begins[run]))
-
-
-def _far_off(t: Array) -> NDArray[np.bool_]:
-    """Which stamps (N,) lie far from those of the rows around; up to five in a row may."""
-    size = min(11, len(t) - 1 + len(t) % 2)
-    around = np.lib.stride_tricks.sliding_window_view(np.pad(t, size // 2, 'reflect'), size)
-    return np.asarray(np.abs(t - np.median(around, axis=1)) > 50.0 * typical_step(t))
+    starts[0] = starts[1] - period * lengths[0]
+    said.append(f'up to {lengths[:-1].max()} rows share a stamp, and move: spread evenly')
+    return np.asarray(np.repeat(starts - period * begins, lengths) + period * np.arange(len(t)))

@@ -3,13 +3,12 @@
 Two kinds of uneven stamps are told apart by the motion itself, which is smooth over the true
 instants: either the samples were taken evenly and their stamps are late, then rows are numbered; or
 they were taken at those instants. Then v, which holds from row to row, is averaged over each period
-of the grid, and y, which was read when it was read, is moved onto the grid only where the error of
-that is hidden by its noise; else the grid is finer, with nothing between the readings.
+of the grid, and y is moved onto it only where the error of that is hidden by its noise; else the
+grid is finer, with nothing between the readings.
 """
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -30,7 +29,7 @@ MOST_SAMPLES = 1_000_000  # of a grid
 
 
 class Rows(NamedTuple):
-    """Rows in order. t (M,): from 0 [s]. y (M,): nan where it is no reading of its own.
+    """Rows in order. t (M,): of each [s]. y (M,): nan where it is no reading of its own.
 
     v, commands: one for each row (M,), or times and values of their own (2, K), as in a log of
     events. reported: whether those of v tell what acted until then.
@@ -42,14 +41,6 @@ class Rows(NamedTuple):
     commands: Array | None = None
     reported: bool = False
 
-    def since(self, start: float, begin: int = 0, end: int | None = None) -> Rows:
-        """Some of the rows, with times that count from `start`."""
-        def part(values: Array) -> Array:
-            return values[begin:end] if values.ndim == 1 else values - np.array([[start], [0.0]])
-
-        return Rows(self.t[begin:end] - start, part(self.v), self.y[begin:end],
-                    None if self.commands is None else part(self.commands), self.reported)
-
 
 class Numbering(NamedTuple):
     """Of rows (M,), whose stamps lie around begin + period * numbers [s], off (M,) that."""
@@ -59,12 +50,6 @@ class Numbering(NamedTuple):
     begin: float
     off: Array
 
-    @staticmethod
-    def along(numbers: Numbers, t: Array) -> Numbering:
-        """With the line that fits t (M,) [s] best."""
-        period, begin = np.polyfit(numbers, t, 1).tolist()
-        return Numbering(numbers, period, begin, t - begin - period * numbers)
-
 
 def on_grid(rows: Rows, period: float | None = None, late: bool = False) -> Record:
     """Rows on a grid. period [s]: of the samples, None tells it from the stamps.
@@ -73,44 +58,37 @@ def on_grid(rows: Rows, period: float | None = None, late: bool = False) -> Reco
     are too few, or they are spread over too long a time.
     """
     nearly_even = 0.02  # of a period that stamps of even samples may be off
-    typical = typical_step(rows.t)
-    guess = period or (typical if late else _period(rows.t))
+    guess = period or (typical_step(rows.t) if late else _period(rows.t))
     rows, cut = _longest_stretch(rows, guess)
     if not np.isfinite(rows.y).any():
         raise RecordError(f'{cut}but y holds no number there: cut out one motion with --from, --to')
-    if late:
-        found = Numbering.along(numbered(rows.t / guess), rows.t)
-        # All stamps together tell it better than one step does, but for how late the first and the
-        # last one were, independently of each other.
-        deviation = 2.0**0.5 * float(np.std(found.off)) / float(found.numbers[-1])
-        used = period or _rounded(found.period, deviation)
-        said = f'{len(rows.t)} messages of y, one every {seconds(used)}'
-        return _numbered_grid(rows, found.numbers, used, cut + said)
     steps = np.diff(rows.t) / guess
-    found = _numbering(rows.t, steps, guess)
+    found = _numbering(rows.t, steps, guess, late)
     used = period or found.period
-    if np.abs(found.off).max() <= nearly_even * guess and \
-            abs(found.period / used - 1.0) <= nearly_even:
-        said = f'{len(rows.t)} rows, one every {seconds(used)}'
-        return _numbered_grid(rows, found.numbers, used, cut + said)
+    if late or (np.abs(found.off).max() <= nearly_even * guess
+                and abs(found.period / used - 1.0) <= nearly_even):
+        what = 'messages of y' if late else 'rows'
+        return _numbered_grid(rows, found.numbers, used,
+                              f'{cut}{len(rows.t)} {what}, one every {seconds(used)}')
     inner = steps[steps <= BREAK]
     jitter = 0.5 * float(np.ptp(np.percentile(inner, [16.0, 84.0])))
     # A few odd ones among even stamps are told as well.
     percent = f'{100.0 * (jitter if jitter > 0.005 else float(np.std(inner))):.2g} %'
     if period is not None:
-        found = Numbering.along(numbered(rows.t / period), rows.t)
+        found = _along(_numbered(rows.t / period), rows.t)
     if _are_late(rows, found):
         return _numbered_grid(
             rows, found.numbers, used, f'{cut}stamps are uneven by {percent} of {seconds(used)}, '
             'the motion is not: rows are numbered')
+    begin = float(rows.t[0])
     if period is None and np.abs(found.off).max() <= 0.5 * used:
-        rows = rows.since(found.begin)
+        begin = found.begin
     else:
         used = guess
     how = f'jitter by {percent} around {seconds(used)}'
     if jitter <= 1e-3 and period is not None:
         how = f'come every {seconds(_period(rows.t))}, for samples of {seconds(used)}'
-    return _true_instants(rows, used, f'{cut}stamps {how}: v and y are taken at them')
+    return _true_instants(rows, begin, used, f'{cut}stamps {how}: v and y are taken at them')
 
 
 def _period(t: Array) -> float:
@@ -125,48 +103,58 @@ def _period(t: Array) -> float:
 def _longest_stretch(rows: Rows, period: float) -> tuple[Rows, str]:
     """Without what lies far before and after, where the time between holds no rows; said so."""
     long_break = 100.0  # periods of a gap that ends a stretch
-    t, span = rows.t, rows.t[-1] / period
+    t, span = rows.t, np.ptp(rows.t) / period
     if span < min(20.0 * len(t) + long_break, MOST_SAMPLES):
         return rows, ''
-    ends = [0, *(np.flatnonzero(np.diff(t) > long_break * period) + 1).tolist(), len(t)]
-    begin, end = max(pairwise(ends), key=lambda part: part[1] - part[0])
-    if end - begin < 2 or t[end - 1] - t[begin] >= MOST_SAMPLES * period:
+    ends = np.flatnonzero(np.diff(t, prepend=-np.inf, append=np.inf) > long_break * period)
+    k = int(np.argmax(np.diff(ends)))
+    part = slice(ends[k], ends[k + 1])
+    if len(t[part]) < 2 or np.ptp(t[part]) >= MOST_SAMPLES * period:
         raise RecordError(
             f'spans {span:.3g} periods of {seconds(period)} with {len(t)} rows: cut out one motion '
             'with --from and --to, or give --period'
         )
+
+    def cut_out(values: Array) -> Array:
+        return values[part] if values.ndim == 1 else values
+
+    commands = None if rows.commands is None else cut_out(rows.commands)
     gaps = f'{len(ends) - 2} long gap{"s" * (len(ends) > 3)}'
-    return rows.since(float(t[begin]), begin, end), \
-        f'{gaps}: the longest stretch, {end - begin} rows, is used; '
+    return Rows(t[part], cut_out(rows.v), rows.y[part], commands, rows.reported), \
+        f'{gaps}: the longest stretch, {len(t[part])} rows, is used; '
 
 
-def _numbering(t: Array, steps: Array, period: float) -> Numbering:
+def _along(numbers: Numbers, t: Array) -> Numbering:
+    """With the line that fits t (M,) [s] best."""
+    period, begin = np.polyfit(numbers, t, 1).tolist()
+    return Numbering(numbers, period, begin, t - begin - period * numbers)
+
+
+def _numbering(t: Array, steps: Array, period: float, late: bool) -> Numbering:
     """The numbers of rows t (M,) that lie closest to a line. steps (M - 1,): in periods."""
-    # The median of uneven steps is off by more than a long record bears.
-    usual = steps[steps < 0.5 * BREAK]
-    mean = period * (float(np.mean(usual)) if usual.any() else 1.0)
-    found = [Numbering.along(index, t) for index in (
-        _risen(np.append(0.0, np.cumsum(np.round(steps)))), numbered(t / period),
-        numbered(t / mean), _risen(np.round(t / period)), _risen(np.round(t / mean)))]
-    # Around the line that all of them tell, as far as they are late by less than a period.
-    found += [Numbering.along(_risen(np.round((t - one.begin) / one.period)), t)
-              for one in found if one.period > 0.0]
+    found = [_along(_numbered(t / period), t)]
+    if not late:
+        # The median of uneven steps is off by more than a long record bears.
+        usual = steps[steps < 0.5 * BREAK]
+        mean = period * (float(np.mean(usual)) if usual.any() else 1.0)
+        found += [_along(numbers, t) for numbers in (
+            _risen(np.append(0.0, np.cumsum(np.round(steps)))), _numbered(t / mean),
+            _risen(np.round((t - t[0]) / period)))]
+        # Around the line that all of them tell, as far as they are late by less than a period.
+        found += [_along(_risen(np.round((t - one.begin) / one.period)), t)
+                  for one in found if one.period > 0.0]
     found = [one for one in found if one.period > 0.0 and one.numbers[-1] < MOST_SAMPLES]
     if not found:
         raise RecordError('t does not rise steadily: give --period S, or cut out one motion')
     best = min(found, key=lambda one: round(float(np.std(one.off)) / one.period, 9))
-    # With no more digits than the stamps bear.
+    # With the fewest digits within its deviation: no more than the stamps bear.
     deviation = max(2.0 * float(np.std(best.off)), 1e-12 * period) / float(best.numbers[-1])
-    return best._replace(period=_rounded(best.period, deviation))
+    texts = (float(f'{best.period:.{digits}g}') for digits in range(1, 9))
+    return best._replace(period=next(
+        (value for value in texts if abs(value - best.period) <= deviation), best.period))
 
 
-def _rounded(period: float, deviation: float) -> float:
-    """The period with the fewest digits that is within its deviation."""
-    texts = (float(f'{period:.{digits}g}') for digits in range(1, 9))
-    return next((value for value in texts if abs(value - period) <= deviation), period)
-
-
-def numbered(times: Array) -> Numbers:
+def _numbered(times: Array) -> Numbers:
     """Number of each sample from its time [sample periods], rising from 0.
 
     Samples are late, never early: what comes before the next one is due is still the sample before,
@@ -210,18 +198,19 @@ def _numbered_grid(rows: Rows, index: Numbers, period: float, said: str) -> Reco
         # What is sent more often than samples are taken is averaged.
         if not reported and values.shape[1] > 1.5 * count:
             return averaged(values[0] - rows.t[0], values[1], period, count)
-        stamps, sent_ns = ((1e9 * each).astype(np.int64) for each in (rows.t, values[0]))
+        stamps, sent_ns = ((1e9 * (each - rows.t[0])).astype(np.int64)
+                           for each in (rows.t, values[0]))
         return v_of_intervals(index, stamps, sent_ns, values[1], reported)
 
     commands = None if rows.commands is None else over(rows.commands)
     return Record(over(rows.v, rows.reported), y, period, timing=said + missing, commands=commands)
 
 
-def _true_instants(rows: Rows, period: float, said: str) -> Record:
-    """v averaged over each period, y where it was read."""
+def _true_instants(rows: Rows, begin: float, period: float, said: str) -> Record:
+    """v averaged over each period from begin [s] on, y where it was read."""
     hidden, least = 0.5, 1e-3  # error of moving y that is hidden: of its noise, of its swing
     known = np.isfinite(rows.y)
-    t, y = rows.t[known], rows.y[known]
+    t, y = rows.t[known] - begin, rows.y[known]
     equal = int(np.count_nonzero(np.diff(rows.t) == 0.0))
     said += f'; {equal} rows with equal stamps' if equal else ''
     kept = np.append(np.diff(t) > 0.0, True)
@@ -252,13 +241,13 @@ def _true_instants(rows: Rows, period: float, said: str) -> Record:
                 values = np.interp(index * step, t, y)
             break
     said += f', on a grid of {seconds(step)}' if parts > 1 else ''
-    count = int(max(rows.t[-1] / step + 0.5, index[-1])) + 1
+    count = int(max((rows.t[-1] - begin) / step + 0.5, index[-1])) + 1
     full = np.full(count, np.nan)
     full[index] = values
 
     def over(values: Array) -> Array:
         times, v = (rows.t, values) if values.ndim == 1 else values
-        return averaged(times, v, step, count)
+        return averaged(times - begin, v, step, count)
 
     commands = None if rows.commands is None else over(rows.commands)
     return Record(over(rows.v), full, step, timing=said, commands=commands)

@@ -77,7 +77,7 @@ def from_messages(heard: Mapping[str, Messages], period: float | None, of_axis: 
         v, commands = commands, None
     if v is None:
         raise RecordError(f'holds no {topics.CONTROL}{of_axis}: record it as well')
-    rows = Rows(t, v, y, commands, reported).since(t[0])
+    rows = Rows(t, v, y, commands, reported)
     record = on_grid(rows, period, late=True)
     step = record.sample_period
     if record.commands is not None:
