@@ -67,14 +67,11 @@ class RecorderNode(ProcessNode):
         super().__init__(RECORDER)
         p, self.failure = self.settings, ''
         self._now_ns: int | None = 0 if p.lockstep else None  # simulated time
-        self._bag: Bag | None = None
         self._channels: dict[str, RecordedTopic] = {}
         self._first_signals = b''
-        if p.bag:
-            self._bag = self._open_bag(p.bag, p.storage)
-            self.log.info(f'started: records to {p.bag} ({p.storage})')
-        else:
-            self.log.info('started: nothing is recorded, as the parameter bag names no folder')
+        self._bag = self._open_bag(p.bag, p.storage) if p.bag else None
+        self.log.info(f'started: records to {p.bag} ({p.storage})' if p.bag else
+                      'started: nothing is recorded, as the parameter bag names no folder')
         to = driver_topics(p)
         # y comes last of all: it starts the loop.
         recorded = {
@@ -116,20 +113,28 @@ class RecorderNode(ProcessNode):
             self.log.info(
                 f'recorded {bag.saved} messages of {bag.saved_ns * 1e-9:.1f} s to {bag.path}'
             )
+            output = self._channels.get(driver_topics(self.settings).output)
+            if self._first_signals and not (output and output.recorded):
+                self._complain(
+                    'the bag holds no output of the driver, which the controller has heard: the '
+                    'recorder did not discover its publisher before the end; let the driver wait '
+                    'until its output has two subscribers, or run longer'
+                )
         for channel in channels:
             if channel.missed:
                 self.log.warning(f'{channel.missed} messages of {channel.name} were missed')
         if self.failure:
             unrecorded = self._received - sum(channel.recorded for channel in channels)
             self.log.warning(f'{unrecorded} messages came after the recording had stopped')
-        emit(
-            'closed', messages={channel.name: channel.recorded for channel in channels},
-            missed=sum(channel.missed for channel in channels), failure=self.failure,
-        )
+        emit('closed', messages={channel.name: channel.recorded for channel in channels})
 
     @property
     def _received(self) -> int:
         return sum(channel.received for channel in self._channels.values())
+
+    def _complain(self, text: str) -> None:
+        self.log.error(text)
+        emit('complaint', text=text)
 
     def _open_bag(self, path: str, storage: str) -> Bag:
         bag = Bag(path, storage)
@@ -154,23 +159,20 @@ class RecorderNode(ProcessNode):
 
     def _with_bag(self, action: Callable[[Bag], None]) -> bool:
         """Do something with the bag; returns whether there is one and it went well."""
-        bag = self._bag
-        if bag is None:
+        if (bag := self._bag) is None:
             return False
         try:
             action(bag)
+            return True
         except RecordingError as error:
-            self._bag = None
+            self._bag, self.exit_code = None, FAILED
             self.failure = (
                 f'recording to {bag.path} stopped: {error}; saved are {bag.saved} messages of '
                 f'{bag.saved_ns * 1e-9:.1f} s; all else goes on. Make room, then: '
                 f'{REPAIR_COMMAND} {bag.path}'
             )
-            self.exit_code = FAILED
-            self.log.error(self.failure)
-            emit('recording_stopped', reason=self.failure)
+            self._complain(self.failure)
             return False
-        return True
 
     def _record(self, topic: str, message_type: type[Any], qos: QoSProfile | int) -> Subscription:
         subscription = self.listen(
@@ -194,17 +196,14 @@ class RecorderNode(ProcessNode):
     def _on_message(self, topic: str, message: bytes, info: dict[str, Any]) -> None:
         channel, sequence = self._channels[topic], info['publication_sequence_number']
         channel.received += 1
-        # Each of several publishers has numbers of its own.
-        if sequence != UNNUMBERED and topic != topics.DIAGNOSTICS:
-            if channel.sequence != UNNUMBERED:
-                channel.missed += max(sequence - channel.sequence - 1, 0)
-            channel.sequence = sequence
-        connection = channel.connection
-        if self._bag is not None and connection is not None:
-            stamp_ns = info['source_timestamp'] if self._now_ns is None else self._now_ns
-            if self._with_bag(lambda bag: bag.write(connection, stamp_ns, message)):
-                channel.recorded += 1
         channel.newest = message
+        # Each of several publishers has numbers of its own.
+        if UNNUMBERED not in (sequence, channel.sequence) and topic != topics.DIAGNOSTICS:
+            channel.missed += max(sequence - channel.sequence - 1, 0)
+        channel.sequence = sequence
+        if (connection := channel.connection) is not None:
+            stamp_ns = info['source_timestamp'] if self._now_ns is None else self._now_ns
+            channel.recorded += self._with_bag(lambda bag: bag.write(connection, stamp_ns, message))
         if topic == topics.SIGNALS:
             self._first_signals = self._first_signals or message
 

@@ -19,6 +19,8 @@ from backlash_ros.options import BAD_INPUT, DONE, FAILED
 from backlash_ros.tools.records.columns import parse_columns
 
 NOTHING = '–'  # in a table, where there is no number
+# The matrices are tiny: more threads would only take the processors from other processes.
+ONE_THREAD = dict.fromkeys(('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'), '1')
 
 
 class InputError(ValueError):

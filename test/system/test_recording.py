@@ -156,7 +156,7 @@ def test_full_disk_stops_the_recording_and_nothing_else(tmp_path: Path) -> None:
         size = max(path.stat().st_size for path in bag.iterdir())
         limit = (size + 20_000,) * 2
         resource.prlimit(nodes['recorder'].process.pid, resource.RLIMIT_FSIZE, limit)
-        reason = nodes['recorder'].wait_for('recording_stopped')['reason']
+        reason = nodes['recorder'].wait_for('complaint')['text']
         assert f'recording to {bag} stopped: ' in reason
         saved, seconds = re.search(r'saved are (\d+) messages of (\d+\.\d) s', reason).groups()
         assert reason.endswith(f'ros2 run backlash_ros recorder --repair {bag}')

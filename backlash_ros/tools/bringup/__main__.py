@@ -98,31 +98,26 @@ def run(plan: RunPlan, requests: StopRequests) -> RunWatch:
         raise BrokenOffError(f'interrupted by {requests.last}')
     discovery = os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     awaited = [axis.name for axis in plan.axes if axis.parameters.driver == ELSEWHERE]
-    said, domain = [], None
+    domain = None
     with ExitStack() as stack:
         if awaited:
             # Whoever started the driver did so in the domain that is set there, or in none.
             of = f' of {", ".join(awaited)}' if awaited != [''] else ''
-            said.append(
-                f'waiting for the driver{of} as long as it takes: start it with ROS_DOMAIN_ID='
-                f'{os.environ.get("ROS_DOMAIN_ID") or 0} '
-                f'ROS_AUTOMATIC_DISCOVERY_RANGE={discovery}'
-            )
+            print(f'waiting for the driver{of} as long as it takes: start it with ROS_DOMAIN_ID='
+                  f'{os.environ.get("ROS_DOMAIN_ID") or 0} '
+                  f'ROS_AUTOMATIC_DISCOVERY_RANGE={discovery}')
         elif not os.environ.get('ROS_DOMAIN_ID'):
             domain = stack.enter_context(free_domain())
-            said.append(f'to listen in: export ROS_DOMAIN_ID={domain} '
-                        f'ROS_AUTOMATIC_DISCOVERY_RANGE={discovery}')
-        managed = [
-            axis.process_name('controller') for axis in plan.axes if not axis.parameters.autostart
-        ]
-        if managed:
-            said.append(f'waiting until somebody activates {", ".join(managed)} (autostart: false)')
-        said += [
-            f'waiting for whoever plans the motion, on {axis.process_name(topics.ROBOT_COMMAND)}'
-            for axis in plan.axes if axis.parameters.joints
-        ]
-        for line in said:
-            print(line, flush=True)
+            print(f'to listen in: export ROS_DOMAIN_ID={domain} '
+                  f'ROS_AUTOMATIC_DISCOVERY_RANGE={discovery}')
+        for axis in plan.axes:
+            if not axis.parameters.autostart:
+                print(f'waiting until somebody activates {axis.process_name("controller")} '
+                      '(autostart: false)')
+            if axis.parameters.joints:
+                print('waiting for whoever plans the motion, on '
+                      f'{axis.process_name(topics.ROBOT_COMMAND)}')
+        sys.stdout.flush()
         stages = plan_processes(plan, domain)
         supervisor = stack.enter_context(ProcessSupervisor(stages, lambda: requests.count > 1))
         watch = RunWatch(plan, supervisor, requests)
@@ -135,7 +130,8 @@ def report(axis: AxisPlan) -> bool:
     # Drawing libraries take a second to load: not before bad input is refused.
     from backlash_ros.tools.bringup.watch import complain
     from backlash_ros.tools.report import REPORT_PAGE, write_report
-    from backlash_ros.tools.runs.read_run import BAG, read_run
+    from backlash_ros.tools.runs.files import BAG
+    from backlash_ros.tools.runs.read_run import read_run
     from backlash_ros.tools.runs.summary import estimate_table
     if not axis.record:
         print(axis.titled(f'no bag and no report (--no-record), logs in {axis.logs}'))

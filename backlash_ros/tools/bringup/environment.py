@@ -11,7 +11,7 @@ from pathlib import Path
 
 import backlash_ros
 from backlash_ros.middleware.loopback import prefer_loopback
-from backlash_ros.tools.cli import BrokenOffError
+from backlash_ros.tools.cli import ONE_THREAD, BrokenOffError
 
 
 def child_environment(log_folder: Path, domain: int | None) -> dict[str, str]:
@@ -19,15 +19,11 @@ def child_environment(log_folder: Path, domain: int | None) -> dict[str, str]:
 
     What the user has set stays. domain: ROS_DOMAIN_ID to set, None to leave it alone.
     """
-    # The matrices are tiny: more threads would only take the processors from each other.
-    one_thread = dict.fromkeys(('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'), '1')
     environment = {
         'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', 'ROS_LOG_DIR': str(log_folder / 'ros'),
-        **one_thread, **with_source(os.environ), 'BACKLASH_ROS_EVENTS': '1',
-        'PYTHONUNBUFFERED': '1',
+        **ONE_THREAD, **with_source(os.environ), 'BACKLASH_ROS_EVENTS': '1',
+        'PYTHONUNBUFFERED': '1', **({'ROS_DOMAIN_ID': str(domain)} if domain is not None else {}),
     }
-    if domain is not None:
-        environment['ROS_DOMAIN_ID'] = str(domain)
     prefer_loopback(environment)  # for drivers; the nodes of this package do so themselves
     return environment
 
@@ -47,11 +43,10 @@ def foreign_environment(environment: Mapping[str, str]) -> dict[str, str]:
     """
     foreign = dict(environment)
     foreign.pop('BACKLASH_ROS_EVENTS', None)
-    if foreign.pop('_ROS_WHEELS_BOOTSTRAP_COMPLETE', None) and 'LD_LIBRARY_PATH' in foreign:
-        folders = foreign.pop('LD_LIBRARY_PATH').split(os.pathsep)
+    if foreign.pop('_ROS_WHEELS_BOOTSTRAP_COMPLETE', None):
+        folders = foreign.pop('LD_LIBRARY_PATH', '').split(os.pathsep)
         kept = [folder for folder in folders if not Path(folder).is_relative_to(sys.prefix)]
-        if kept:
-            foreign['LD_LIBRARY_PATH'] = os.pathsep.join(kept)
+        foreign['LD_LIBRARY_PATH'] = os.pathsep.join(filter(None, kept))
     return foreign
 
 

@@ -18,8 +18,7 @@ from backlash_ros.tools.bringup.environment import child_environment, foreign_en
 from backlash_ros.tools.bringup.supervisor import Child
 from backlash_ros.tools.cli import BrokenOffError, InputError, number_of_samples, print_warnings
 from backlash_ros.tools.config import read_configuration, write_config
-from backlash_ros.tools.runs.files import CONFIG_FILE, result_directory
-from backlash_ros.tools.runs.read_run import BAG
+from backlash_ros.tools.runs.files import BAG, CONFIG_FILE, result_directory
 
 ELSEWHERE = 'none'  # the parameter driver where somebody else starts it
 
@@ -84,32 +83,29 @@ def prepare(options: argparse.Namespace) -> RunPlan:
     if len(names) > 7:
         raise InputError(f'{len(names)} axes are too many for one machine: at most 7')
     parameters: dict[str, Parameters] = {}
+    users: dict[str, str] = {}
     for name in names:
         try:
-            parameters[name] = _checked(configuration.of_controller(name), name, options)
+            p = parameters[name] = _checked(configuration.of_controller(name), name, options)
         except (ParameterError, InputError) as error:
             error.args = (f'{name}: {error}' if name else str(error),)
             raise
-    if options.unlimited and not any(values.driver for values in parameters.values()):
-        raise InputError('--unlimited is about a driver: give --driver as well')
-    users: dict[str, str] = {}
-    for name, values in parameters.items():
-        file = values.estimates.file
+        file = p.estimates.file
         if file and users.setdefault(file, name) != name:
             raise ParameterError(
                 'estimates.file', file, f'is the file of {users[file]} and of {name}',
                 f'give each axis one of its own, like --set {name}/estimates.file=...',
             )
-        for joint in values.joint_names:
-            print_warnings(': '.join(filter(None, ('bringup', name, joint))),
-                           values.of_joint(joint))
         if options.out is not None and (options.out / name / BAG).exists():
             raise InputError(f'--out={options.out}: holds a bag already, choose another folder')
+    if options.unlimited and not any(p.driver for p in parameters.values()):
+        raise InputError('--unlimited is about a driver: give --driver as well')
+    for name, p in parameters.items():
+        for joint in p.joint_names:
+            print_warnings(': '.join(filter(None, ('bringup', name, joint))), p.of_joint(joint))
     # The nodes need a path that holds wherever it is read.
     out = result_directory(options.out).resolve()
-    axes = tuple(
-        AxisPlan(name, values, out / name, options.record) for name, values in parameters.items()
-    )
+    axes = tuple(AxisPlan(name, p, out / name, options.record) for name, p in parameters.items())
     try:
         for axis in axes:
             axis.logs.mkdir(parents=True, exist_ok=True)
@@ -130,18 +126,18 @@ def _checked(p: Parameters, axis: str, options: argparse.Namespace) -> Parameter
         shlex.split(driver)
     except ValueError as error:
         raise ParameterError('driver', driver, 'is not a command', str(error)) from None
-    for wrong, rule, cure in (
-        (driver and p.lockstep, 'excludes lockstep',
+    for wrong, name, value, rule, cure in (
+        (driver and p.lockstep, 'driver', driver, 'excludes lockstep',
          'a real plant does not wait for its control'),
-        ('{axis}' in driver and not axis, 'names an axis', 'list the axes in the parameter axes'),
-        (p.joints and not driver, 'is empty, and nothing here simulates several joints',
-         'give --driver COMMAND, or none for one that you start yourself; '
+        ('{axis}' in driver and not axis, 'driver', driver, 'names an axis',
+         'list the axes in the parameter axes'),
+        (p.joints and not driver, 'driver', driver, 'is empty, and nothing here simulates several '
+         'joints', 'give --driver COMMAND, or none for one that you start yourself; '
          '`simulate --axis JOINT` simulates one of them'),
+        (p.bag, 'bag', p.bag, 'is made by bringup', 'choose its folder with --out'),
     ):
         if wrong:
-            raise ParameterError('driver', driver, rule, cure)
-    if p.bag:
-        raise ParameterError('bag', p.bag, 'is made by bringup', 'choose its folder with --out')
+            raise ParameterError(name, value, rule, cure)
     for joint in p.joint_names:
         own = p.of_joint(joint)
         if driver and not options.unlimited and (missing := own.missing_limits):

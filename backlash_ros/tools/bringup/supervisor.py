@@ -9,7 +9,6 @@ and a signal finds one loop to wake.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import selectors
@@ -18,7 +17,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,7 @@ class Child:
     it prints goes to its log, and signals reach it from the very start. spectator: the run goes on
     without it. settle_s: time that passes before it is stopped, in which what was stopped before
     still has an effect on it. grace_s: time that it needs for its end beyond what any process gets.
-    process: once it has started.
+    process: once it has started. unfinished: the beginning of a line of its output.
     """
 
     name: str
@@ -50,7 +51,7 @@ class Child:
     settle_s: float = 0.0
     grace_s: float = 0.0
     process: subprocess.Popen[bytes] = field(init=False)
-    unfinished: bytes = field(default=b'', init=False)  # of a line
+    unfinished: bytes = field(default=b'', init=False)
 
     def start(self) -> None:
         """Raises BrokenOffError for a program that cannot be started."""
@@ -80,7 +81,7 @@ class Child:
         *lines, self.unfinished = (self.unfinished + chunk).split(b'\n')
         found = []
         for line in lines:
-            with contextlib.suppress(ValueError):
+            with suppress(ValueError):
                 content = json.loads(line)
                 if isinstance(content, dict) and 'event' in content:
                     found.append(content)
@@ -91,9 +92,8 @@ class Child:
 
     def describe_end(self, what: str, further: str = '') -> str:
         """What became of it, how it exited, and the end of its log."""
-        code, end = self.process.returncode, f'exit code {self.process.returncode}'
-        if code is not None and code < 0:
-            end = f'killed by {signal.Signals(-code).name}'
+        code = self.process.returncode
+        end = f'killed by {signal.Signals(-code).name}' if code < 0 else f'exit code {code}'
         return f'{self.name} {what} ({end}){further}, the end of {self.end_of_log()}'
 
     def end_of_log(self) -> str:
@@ -108,11 +108,12 @@ class ProcessSupervisor:
 
     stages: in the order in which they are to be stopped, those of one stage together; all are
     started together. hurry: asked while stopping; once it says yes, nobody is given any more time.
+    children: those that were started.
     """
 
     def __init__(self, stages: Sequence[Sequence[Child]], hurry: Callable[[], bool]) -> None:
-        self._planned, self._hurry = stages, hurry
-        self._stages: list[list[Child]] = [[] for _ in stages]
+        self._stages, self._hurry = stages, hurry
+        self.children: list[Child] = []
         self._selector = selectors.DefaultSelector()
 
     def __enter__(self) -> ProcessSupervisor:
@@ -121,14 +122,15 @@ class ProcessSupervisor:
             stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, env=with_source(os.environ),
             start_new_session=True,
         )
+        assert self._guardian.stdin is not None
         try:
-            for started, planned in zip(self._stages, self._planned, strict=True):
-                for child in planned:
-                    child.start()
-                    started.append(child)
-                    self._tell_guardian(list(map(_groups, self._stages)))
-                    if child.process.stdout is not None:
-                        self._selector.register(child.process.stdout, selectors.EVENT_READ, child)
+            for child in chain(*self._stages):
+                child.start()
+                self.children.append(child)
+                with suppress(BrokenPipeError):
+                    self._guardian.stdin.write(f'{json.dumps(self._to_stop())}\n'.encode())
+                if child.process.stdout is not None:
+                    self._selector.register(child.process.stdout, selectors.EVENT_READ, child)
         except BaseException:
             self.__exit__()
             raise
@@ -140,14 +142,7 @@ class ProcessSupervisor:
         for child in self.children:
             if child.process.stdout is not None:
                 child.process.stdout.close()
-        self._tell_guardian([])
-        assert self._guardian.stdin is not None
-        self._guardian.stdin.close()
-        self._guardian.wait()
-
-    @property
-    def children(self) -> list[Child]:
-        return [child for stage in self._stages for child in stage]
+        self._guardian.communicate(b'[]\n')
 
     def events(self, timeout: float) -> list[tuple[Child, dict[str, Any]]]:
         """What the processes have said; waits up to timeout [s] for a first word."""
@@ -166,71 +161,56 @@ class ProcessSupervisor:
         def listen() -> None:
             last_words.extend(self.events(0.02))
 
-        for children in self._stages:
-            settle_s = max((c.settle_s for c in children if not c.has_ended), default=0.0)
-            settled = time.monotonic() + settle_s
-            while time.monotonic() < settled and not self._hurry():
-                listen()
-            stop_groups(*_groups(children), listen, self._hurry)
-            for child in children:
-                child.process.poll()
+        for stage in self._to_stop():
+            stop_groups(*stage, listen, self._hurry)
+        for child in self.children:
+            child.process.poll()
         while self._selector.select(0.0):
             listen()
         return last_words
 
-    def _tell_guardian(self, stages: Sequence[tuple[list[int], float]]) -> None:
-        """Say what is to be stopped, stage by stage, should this process die."""
-        assert self._guardian.stdin is not None
-        with contextlib.suppress(BrokenPipeError):
-            self._guardian.stdin.write(f'{json.dumps(stages)}\n'.encode())
-
-
-def _groups(children: Sequence[Child]) -> tuple[list[int], float]:
-    """Process groups of a stage, and the longest time that one of them needs beyond the usual."""
-    grace_s = max((child.grace_s for child in children), default=0.0)
-    return [child.process.pid for child in children], grace_s
+    def _to_stop(self) -> list[tuple[list[int], float, float]]:
+        """Of each stage its process groups, and the longest settle_s and grace_s of them."""
+        return [(
+            [child.process.pid for child in stage if child in self.children],
+            max((child.settle_s for child in stage), default=0.0),
+            max((child.grace_s for child in stage), default=0.0),
+        ) for stage in self._stages]
 
 
 def stop_groups(
-    groups: Sequence[int], grace_s: float, wait: Callable[[], None], hurry: Callable[[], bool],
+    groups: Sequence[int], settle_s: float, grace_s: float, wait: Callable[[], None],
+    hurry: Callable[[], bool],
 ) -> None:
     """Signal process groups, ever more firmly, until none is alive or all means are used up.
 
-    grace_s: how much longer the first signal may take than usual. wait: passes a moment. hurry: yes
-    skips to SIGKILL.
+    settle_s: before the first signal. grace_s: how much longer that may take than usual. wait:
+    passes a moment. hurry: yes skips to SIGKILL.
     """
-    for number, patience_s in ESCALATION:
-        last = number == signal.SIGKILL
-        deadline = time.monotonic() + patience_s + grace_s
-        grace_s = 0.0
+    (first, usual_s), *others = ESCALATION
+    # The signal 0 is none.
+    for number, patience_s in ((0, settle_s), (first, usual_s + grace_s), *others):
+        deadline, last = time.monotonic() + patience_s, number == signal.SIGKILL
         if last or not hurry():
-            for group in filter(group_exists, groups):
-                with contextlib.suppress(ProcessLookupError, PermissionError):
+            for group in living(groups):
+                with suppress(ProcessLookupError, PermissionError):
                     os.killpg(group, number)
-        while (last or not hurry()) and any(map(group_exists, groups)) \
-                and time.monotonic() < deadline:
+        while (last or not hurry()) and time.monotonic() < deadline and living(groups):
             wait()
 
 
-def group_exists(group: int) -> bool:
-    """Whether a process of this group is left; a zombie is none, for it may never be collected."""
-    try:
-        os.killpg(group, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
+def living(groups: Sequence[int]) -> set[int]:
+    """The groups with a process left; a zombie is none, for it may never be collected."""
+    found = set()
     for stat in Path('/proc').glob('[0-9]*/stat'):
-        try:
+        with suppress(OSError):  # gone meanwhile
             text = stat.read_text(encoding='utf-8', errors='replace')
-        except OSError:
-            continue  # gone meanwhile
-        # The name of the program stands in parentheses and may hold anything: proc_pid_stat(5).
-        state, _, its_group, *others = text.rpartition(')')[2].split()
-        # Where only the main thread has ended, the process is shown as a zombie with threads.
-        if int(its_group) == group and (state not in 'XZ' or (state == 'Z' and others[14] != '1')):
-            return True
-    return False
+            # The name of the program stands in parentheses and may hold anything: proc_pid_stat(5).
+            state, _, group, *others = text.rpartition(')')[2].split()
+            # Where only the main thread has ended, the process is shown as a zombie with threads.
+            if state not in 'XZ' or (state == 'Z' and others[14] != '1'):
+                found.add(int(group))
+    return found.intersection(groups)
 
 
 def guard(lines: Iterable[str]) -> None:
@@ -241,11 +221,11 @@ def guard(lines: Iterable[str]) -> None:
     """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
-    stages: Sequence[tuple[Sequence[int], float]] = []
+    stages: Sequence[tuple[Sequence[int], float, float]] = []
     for line in lines:
         stages = json.loads(line)
-    for groups, grace_s in stages:
-        stop_groups(groups, grace_s, lambda: time.sleep(0.02), lambda: False)
+    for stage in stages:
+        stop_groups(*stage, lambda: time.sleep(0.02), lambda: False)
 
 
 if __name__ == '__main__':

@@ -16,8 +16,7 @@ from backlash_ros.tools.bringup.plan import ELSEWHERE, AxisPlan, RunPlan
 from backlash_ros.tools.bringup.supervisor import Child, ProcessSupervisor
 from backlash_ros.tools.cli import BrokenOffError, StopRequests, number
 
-READY_DEADLINE_S = 30.0  # for the start of every process
-FIRST_SAMPLE_DEADLINE_S = 30.0  # of a driver that bringup has started
+START_DEADLINE_S = 30.0  # for the start of every process, and the first sample of a driver
 LATE_DEADLINE_S = 10.0  # that a run in real time may take longer than it should
 
 
@@ -97,28 +96,24 @@ class AxisProgress:
         now, plan, p = time.monotonic(), self.plan, self.plan.parameters
         due = inf if p.samples == 0 or p.lockstep else \
             self.began + p.samples * p.sample_period + LATE_DEADLINE_S
+        at = f' after sample {self.first + self.made - 1}' if self.made else ''
+        silence, failure = f'no new sample for {self.patience:g} s{at}', ''
         if self.complete:
             return
         if p.driver and self.made == 0:
-            if p.driver != ELSEWHERE and now > self.began + FIRST_SAMPLE_DEADLINE_S:
-                raise BrokenOffError(plan.titled(
-                    f'no sample within {FIRST_SAMPLE_DEADLINE_S:g} s: does the driver publish its '
-                    f'output? See {plan.logs}; where it needs longer, start it yourself '
-                    '(--driver none)'
-                ))
+            if p.driver != ELSEWHERE and now > self.began + START_DEADLINE_S:
+                failure = (f'no sample within {START_DEADLINE_S:g} s: does the driver publish its '
+                           'output? Where it needs longer, start it yourself (--driver none)')
         elif now > due:
-            raise BrokenOffError(plan.titled(
-                f'only {self.made} of {p.samples} samples, {LATE_DEADLINE_S:g} s after the end '
-                f'was due, see {plan.logs}'
-            ))
+            failure = (f'only {self.made} of {p.samples} samples, {LATE_DEADLINE_S:g} s after the '
+                       'end was due')
         elif now > self.moved + self.patience and not self.silent:
-            at = f' after sample {self.first + self.made - 1}' if self.made else ''
-            silence = plan.titled(f'no new sample for {self.patience:g} s{at}')
-            if not p.driver:
-                raise BrokenOffError(f'{silence}, see {plan.logs}')
             # The controller knows what to do when a real plant falls silent.
-            self.silent = True
-            complain(f'{silence}, waiting for the driver')
+            self.silent, failure = True, '' if p.driver else silence
+            if p.driver:
+                complain(plan.titled(f'{silence}, waiting for the driver'))
+        if failure:
+            raise BrokenOffError(plan.titled(f'{failure}, see {plan.logs}'))
 
 
 class RunWatch:
@@ -168,35 +163,29 @@ class RunWatch:
             and any(axis.plan.parameters.samples == 0 for axis in axes)
 
     def _wait_until_ready(self) -> None:
-        deadline = time.monotonic() + READY_DEADLINE_S
-
-        def missing() -> list[Child]:
-            return [child for child in self._supervisor.children
-                    if not child.foreign and child.name not in self._ready]
-
-        while missing():
+        deadline = time.monotonic() + START_DEADLINE_S
+        while missing := [child for child in self._supervisor.children
+                          if not child.foreign and child.name not in self._ready]:
             self._listen()
-            late = [child for child in missing()
-                    if child.name not in self.axes[child.axis].plan.waiting]
+            late = [child for child in missing if child.name not in self._ready
+                    and child.name not in self.axes[child.axis].plan.waiting]
             if late and time.monotonic() > deadline:
-                names = ', '.join(child.name for child in late)
                 hint = ' (a controller waits until the driver subscribes to its command)' \
                     if any(axis.plan.parameters.driver for axis in self.axes.values()) else ''
-                logs = '\n'.join(f'the end of {child.end_of_log()}' for child in late)
-                raise BrokenOffError(
-                    f'not ready within {READY_DEADLINE_S:g} s: {names}{hint}\n{logs}'
-                )
+                raise BrokenOffError('\n'.join([
+                    f'not ready within {START_DEADLINE_S:g} s: '
+                    f'{", ".join(child.name for child in late)}{hint}',
+                    *(f'the end of {child.end_of_log()}' for child in late),
+                ]))
 
     def _catch_up(self) -> None:
         """Wait until the recorder has heard all that was published, and say what is missing."""
         # The middleware sends again what got lost on the way to a recorder that was held up, with
         # its own settings every 3 s.
-        deadline = time.monotonic() + 10.0
-        while not self._over and time.monotonic() < deadline and any(
-            axis.unheard for axis in self.axes.values()
-        ):
+        deadline, axes = time.monotonic() + 10.0, self.axes.values()
+        while not self._over and time.monotonic() < deadline and any(a.unheard for a in axes):
             self._listen()
-        for axis in self.axes.values():
+        for axis in axes:
             if axis.unheard:
                 missing = ', '.join(f'{count} {what}' for what, count in axis.unheard.items())
                 complain(axis.plan.titled(
@@ -210,11 +199,10 @@ class RunWatch:
             raise BrokenOffError(f'interrupted by {self._requests.last}, stopping')
         dead = []
         for child in self._supervisor.children:
-            name = child.name
-            if not child.has_ended or name in self._gone:
+            if not child.has_ended or child.name in self._gone:
                 continue
-            if child.spectator and name in self._ready:
-                self._gone.add(name)
+            if child.spectator and child.name in self._ready:
+                self._gone.add(child.name)
                 complain(child.describe_end('died', ', the run goes on without it'))
             else:
                 dead.append(child.describe_end('died'))
@@ -231,18 +219,9 @@ class RunWatch:
             axis.published = content['published']
         elif kind == 'progress':
             axis.take(content)
-        elif kind == 'recording_stopped':
+        elif kind == 'complaint':
             # The log may lie on the very disk that is full.
-            complain(content['reason'])
-        elif kind == 'closed' and axis.plan.record and axis.made and not content['failure']:
-            outputs = topics.PLANT_OUTPUT, topics.JOINT_STATES, topics.ROBOT_STATES
-            for topic, count in content['messages'].items():
-                if topic.rpartition('/')[2] in outputs and not count:
-                    complain(
-                        f'the bag holds no message of {topic}, which the controller has heard: the '
-                        'recorder did not discover its publisher before the end of the run; let '
-                        f'the driver wait until {topic} has two subscribers, or run longer'
-                    )
+            complain(axis.plan.titled(content['text']))
 
     def _judge_exits(self) -> None:
         """Check the exit codes of the processes that were asked to end."""

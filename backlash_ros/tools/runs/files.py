@@ -24,7 +24,7 @@ from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 from backlash_ros.tools.cli import InputError
 
 SAMPLES_FILE, RECORD_FILE = 'samples.csv', 'record.npz'
-CONFIG_FILE = 'parameters.yaml'
+CONFIG_FILE, BAG = 'parameters.yaml', 'bag'
 SAMPLE_COLUMNS = (*COLUMNS[:COLUMNS.index('u_hat')], 'status')
 
 

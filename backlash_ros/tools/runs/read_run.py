@@ -16,9 +16,7 @@ from backlash_ros.tools.cli import WHOLE_SPAN, BrokenOffError, InputError, Span
 from backlash_ros.tools.config import read_configuration
 from backlash_ros.tools.runs import files
 from backlash_ros.tools.runs.bag import read_bag
-from backlash_ros.tools.runs.files import CONFIG_FILE, RECORD_FILE, SAMPLES_FILE, Run
-
-BAG = 'bag'  # folder of the bag within the results
+from backlash_ros.tools.runs.files import BAG, CONFIG_FILE, RECORD_FILE, SAMPLES_FILE, Run
 
 
 def read_run(

@@ -75,7 +75,7 @@ def watch(
 def test_a_process_that_is_never_ready_is_named_with_the_end_of_its_log(
     watch: Callable[..., Watched], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(watching, 'READY_DEADLINE_S', 5.0)
+    monkeypatch.setattr(watching, 'START_DEADLINE_S', 5.0)
     lines = 'import time; print("hello", *range(100, 130), sep="\\n", flush=True)'
     run = watch(slow=f'{lines}; time.sleep(600)', quick=f'{READY}; {WAIT}')
     assert run.failure.startswith('not ready within 5 s: slow\n')

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from backlash_ros.tools.bringup.plan import AxisPlan
-from backlash_ros.tools.bringup.watch import FIRST_SAMPLE_DEADLINE_S, LATE_DEADLINE_S, AxisProgress
+from backlash_ros.tools.bringup.watch import LATE_DEADLINE_S, START_DEADLINE_S, AxisProgress
 from backlash_ros.tools.cli import BrokenOffError
 from backlash_ros.tools.config import effective_parameters
 
@@ -77,7 +77,7 @@ def test_too_few_samples_are_an_error_when_the_time_is_over(tmp_path: Path) -> N
 def test_a_driver_without_a_first_sample_is_an_error_unless_somebody_else_starts_it(tmp_path):
     for driver in ('some command', 'none'):
         axis = begun(tmp_path, driver)
-        let_pass(axis, FIRST_SAMPLE_DEADLINE_S - 1.0)
+        let_pass(axis, START_DEADLINE_S - 1.0)
         axis.check_pace()
         let_pass(axis, 2.0)
         if driver == 'none':
