@@ -54,11 +54,8 @@ __all__ = [
 
 # What a process imports that makes fits and gains.
 WORKER_MODULES = (fitted.__module__, better_design.__module__)
-LAWS = tuple(dict.fromkeys(
-    dict(BY_NAME['estimator.law'].aliases).get(law, law)
-    for law in BY_NAME['estimator.law'].choices
-))
-STRUCTURES = BY_NAME['structure'].choices
+LAWS = tuple(dict.fromkeys(BY_NAME['estimator.law'].choices.values()))
+STRUCTURES = tuple(BY_NAME['structure'].choices)
 # Laws that belong to one structure, and why.
 ONLY_IN = {
     'printed': ('proportional', 'the law solves u_d = y_m + f v (3.2), which no other one has'),

@@ -19,7 +19,7 @@ from backlash_ros.core.parameters import Parameters, check_names, check_value
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.parameter import Parameter, Value
 from backlash_ros.core.parameters.parameter_set import entry_of
-from backlash_ros.core.parameters.table import BRINGUP, BY_NAME, CONTROLLER, NODES, PARAMETERS
+from backlash_ros.core.parameters.table import BRINGUP, BY_NAME, CONTROLLER, NODES
 from backlash_ros.shipped import find_config
 from backlash_ros.tools.cli import InputError
 
@@ -300,8 +300,8 @@ def config_text(parameters: Parameters) -> str:
     What is of bringup alone stands in a section of its own, and only if it is given. Empty lists,
     which ROS 2 does not have, are left out.
     """
-    common = [p for p in PARAMETERS if p.used_by != (BRINGUP,) and parameters[p.name] != ()]
-    own = [p for p in PARAMETERS if p not in common and parameters[p.name] != p.default]
+    common = [p for p in BY_NAME.values() if p.used_by != (BRINGUP,) and parameters[p.name] != ()]
+    own = [p for p in BY_NAME.values() if p not in common and parameters[p.name] != p.default]
     of_all = _tree(parameters, common)
     for joint in parameters.joints:
         of_joint = parameters.of_joint(joint)

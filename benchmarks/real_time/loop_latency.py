@@ -17,7 +17,7 @@ from std_msgs.msg import Float64
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_plant, build_reference
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.table import CONTROLLER, PARAMETERS
+from backlash_ros.core.parameters.table import BY_NAME, CONTROLLER
 from real_time.measuring_node import MeasuringNode
 from real_time.node_processes import (
     DEADLINE_S,
@@ -179,7 +179,7 @@ def measure_latency(
 
 def _values_of(executable: str, parameters: Parameters) -> dict[str, object]:
     return {
-        parameter.name: parameters[parameter.name] for parameter in PARAMETERS
+        parameter.name: parameters[parameter.name] for parameter in BY_NAME.values()
         if executable in parameter.used_by and parameters[parameter.name] != parameter.default
     }
 

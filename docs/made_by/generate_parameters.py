@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from backlash_ros.core.parameters.parameter import Parameter, as_yaml
-from backlash_ros.core.parameters.table import PARAMETERS
+from backlash_ros.core.parameters.table import BY_NAME
 
 PAGE = Path(__file__).resolve().parents[1] / 'reference' / 'parameters.md'
 HEAD = """# Parameters
@@ -23,11 +23,11 @@ a running node; all others of `controller`, but for those marked *fixed*, while 
 
 def parameters_page() -> str:
     """The whole page."""
-    return HEAD + ''.join(f'{_row(parameter)}\n' for parameter in PARAMETERS)
+    return HEAD + ''.join(f'{_row(parameter)}\n' for parameter in BY_NAME.values())
 
 
 def _row(p: Parameter) -> str:
-    users = ', '.join([*p.used_by, *(['*live*'] * p.live), *(['*fixed*'] * p.fixed)])
+    users = ', '.join([*p.used_by, *{'live': ['*live*'], 'never': ['*fixed*']}.get(p.change, [])])
     cells = (f'`{p.name}`', f'`{as_yaml(p.default)}`', p.unit, _allowed(p), p.description, users)
     return '| ' + ' | '.join(cell.replace('|', '\\|') for cell in cells) + ' |'
 

@@ -11,7 +11,7 @@ from ros_processes import Probe, ros_world
 from std_msgs.msg import Float64, Float64MultiArray
 
 from backlash_ros import topics
-from backlash_ros.core.parameters.table import PARAMETERS
+from backlash_ros.core.parameters.table import BY_NAME
 
 
 class Client:
@@ -91,7 +91,7 @@ def test_what_was_dumped_is_complete_and_loads_without_a_change(tmp_path: Path) 
             node = world.start(name, {'wait_for_subscribers': 1, **parameters} if name in (
                 'plant', 'reference') else parameters)
             before = dumped(probe, name)
-            declared = {p.name for p in PARAMETERS if name in p.used_by}
+            declared = {p.name for p in BY_NAME.values() if name in p.used_by}
             assert declared <= before.keys()
             for key, value in parameters.items():
                 assert before[key] == value

@@ -17,30 +17,36 @@ Group = TypeVar('Group')
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter: its default gives its type, low and high hold for each element of a list.
+    """A parameter. elements: the types of those of a list, with ... for any number of them.
 
-    above: low itself is excluded. choices: the allowed words. aliases: former words among them,
-    each with the one that it stands for. used_by: executables that read it. live: may change in a
-    running node. fixed: may not even change in a controller that is unconfigured. per_node: a
-    controller with several joints has it once. length: how many elements a list must have, None
-    for any. names: a list of names instead of numbers.
+    low, high: bounds, of each element of a list. above: low itself is excluded. choices: the
+    allowed words, each with the one that it stands for. used_by: executables that read it. change:
+    'live' in a running node, in an 'unconfigured' controller, or 'never'. per_node: a controller
+    with several joints has it once.
     """
 
     name: str
     default: Value
     description: str
+    elements: tuple[Any, ...]
     unit: str = ''
     low: float = -inf
     high: float = inf
     above: bool = False
-    choices: tuple[str, ...] = ()
-    aliases: tuple[tuple[str, str], ...] = ()
+    choices: Mapping[str, str] = field(default_factory=dict)
     used_by: tuple[str, ...] = ('controller',)
-    live: bool = False
-    fixed: bool = False
+    change: str = 'unconfigured'
     per_node: bool = False
-    length: int | None = None
-    names: bool = False
+
+    @property
+    def names(self) -> bool:
+        """Whether it is a list of names instead of numbers."""
+        return str in self.elements
+
+    @property
+    def length(self) -> int | None:
+        """How many elements a list must have, None for any."""
+        return None if not self.elements or ... in self.elements else len(self.elements)
 
     @property
     def infinite(self) -> bool:
@@ -50,39 +56,39 @@ class Parameter:
     @property
     def rules(self) -> str:
         """The bounds in words, empty without any."""
-        sign = '>' if self.above else '>='
-        return ' and '.join(
-            ([f'{sign} {self.low:g}'] if isfinite(self.low) else [])
-            + ([f'<= {self.high:g}'] if isfinite(self.high) else [])
-        )
+        bounds = ('>' if self.above else '>=', self.low), ('<=', self.high)
+        return ' and '.join(f'{sign} {bound:g}' for sign, bound in bounds if isfinite(bound))
 
 
-def option(default: Any, description: str, unit: str = '', **rules: Any) -> Any:
-    """The field of a group that declares a parameter. rules: fields of Parameter."""
-    declare = partial(Parameter, default=default, description=description, unit=unit, **rules)
-    return field(default=default, metadata={'declare': declare})
+def option(
+    default: Any, description: str, unit: str = '', choices: Iterable[str] = (), **rules: Any,
+) -> Any:
+    """The field of a group that declares a parameter.
+
+    choices: words; 'OLD=NEW' is one that stands for another. rules: fields of Parameter.
+    """
+    words = {word: meant or word for word, _, meant in (each.partition('=') for each in choices)}
+    return field(default=default, metadata={'declare': partial(
+        Parameter, default=default, description=description, unit=unit, choices=words, **rules,
+    )})
 
 
 def declared_in(group: type[Any], prefix: str = '') -> Iterator[Parameter]:
-    """The parameters of a group and of the groups in it; lists are described by their type."""
+    """The parameters of a group and of the groups in it."""
     types = get_type_hints(group)
     for each in fields(group):
-        name = prefix + each.name
-        if 'declare' in each.metadata:
-            elements = get_args(types[each.name])
-            yield each.metadata['declare'](
-                name=name, names=str in elements,
-                length=len(elements) if elements and ... not in elements else None,
-            )
+        name, kind = prefix + each.name, types[each.name]
+        if declare := each.metadata.get('declare'):
+            yield declare(name=name, elements=get_args(kind))
         else:
-            yield from declared_in(types[each.name], f'{name}.')
+            yield from declared_in(kind, f'{name}.')
 
 
 def filled(group: type[Group], values: Mapping[str, Value], prefix: str = '') -> Group:
     """A group with the values of its parameters, given by their names."""
     untyped: Any = group
     return group(**{
-        each.name: values[prefix + each.name] if 'declare' in each.metadata
+        each.name: values[prefix + each.name] if each.metadata
         else filled(type(each.default), values, f'{prefix}{each.name}.')
         for each in fields(untyped)
     })
@@ -104,41 +110,42 @@ def as_yaml(value: Value) -> str:
 def check_value(parameter: Parameter, value: object) -> Value:
     """Return value in the type of the parameter; raises ParameterError."""
     default, refused = parameter.default, partial(ParameterError, parameter.name)
+    if isinstance(default, tuple):
+        return list_of_names(parameter, value) if parameter.names else _numbers(parameter, value)
+    if isinstance(default, bool) or 'true' in parameter.choices:
+        # YAML and ROS 2 take true and false for more than words.
+        value = str(value).lower() if isinstance(value, (bool, str)) else value
     if isinstance(default, bool):
-        if not isinstance(value, (bool, str)) or str(value).lower() not in ('true', 'false'):
+        if value not in ('true', 'false'):
             raise refused(value, 'must be true or false')
-        return str(value).lower() == 'true'
+        return value == 'true'
     if isinstance(default, str):
-        if 'true' in parameter.choices and isinstance(value, (bool, str)):
-            value = str(value).lower()  # YAML and ROS 2 take true and false for more than words
         if not isinstance(value, str):
             raise refused(value, 'must be a text')
         if parameter.choices and value not in parameter.choices:
             raise refused(value, 'must be one of ' + ', '.join(parameter.choices))
-        return dict(parameter.aliases).get(value, value)
-    if isinstance(default, tuple):
-        return list_of_names(parameter, value) if parameter.names else _numbers(parameter, value)
+        return parameter.choices.get(value, value)
     number = _number(parameter, value)
-    if isinstance(default, float):
-        return number
-    if number != int(number):
+    if isinstance(default, int) and number != int(number):
         raise refused(value, 'must be a whole number')
     # Beyond 2^53 the detour over a float would lose digits.
-    return value if isinstance(value, int) else int(number)
+    return number if isinstance(default, float) else value if isinstance(value, int) \
+        else int(number)
 
 
-def _elements(parameter: Parameter, value: object, kind: str) -> list[object]:
+def _elements(parameter: Parameter, value: object) -> list[object]:
     if isinstance(value, str):
         listed = value.strip('[] ')
         value = [element.strip() for element in listed.split(',')] if listed else []
     if isinstance(value, Mapping) or not isinstance(value, Iterable):
+        kind = 'names' if parameter.names else 'numbers'
         raise ParameterError(parameter.name, value, f'must be a list of {kind}')
     return list(value)
 
 
 def list_of_names(parameter: Parameter, value: object) -> tuple[str, ...]:
     """Return a list of names, each once; raises ParameterError."""
-    names = _elements(parameter, value, 'names')
+    names = _elements(parameter, value)
     namespace = re.compile('[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*')  # as ROS takes it
     for name in names:
         if not isinstance(name, str) or not namespace.fullmatch(name) or names.count(name) > 1:
@@ -150,7 +157,7 @@ def list_of_names(parameter: Parameter, value: object) -> tuple[str, ...]:
 
 
 def _numbers(parameter: Parameter, value: object) -> tuple[float, ...]:
-    elements = _elements(parameter, value, 'numbers')
+    elements = _elements(parameter, value)
     numbers = tuple(_number(parameter, element) for element in elements)
     if len(numbers) != (parameter.length or len(numbers)):
         raise ParameterError(parameter.name, elements, f'must have {parameter.length} numbers')
@@ -167,8 +174,8 @@ def _number(parameter: Parameter, value: Any) -> float:
     except OverflowError:
         raise refused('...', 'is too large for a number') from None
     except (TypeError, ValueError):
-        number = None
-    if number is None or isinstance(value, bool):
+        raise refused(value, 'must be a number') from None
+    if isinstance(value, bool):
         raise refused(value, 'must be a number')
     if isnan(number) or not (isfinite(number) or parameter.infinite):
         raise refused(number, 'must be finite')

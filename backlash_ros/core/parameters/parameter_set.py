@@ -42,17 +42,12 @@ class Parameters(ParameterTree, Mapping[str, Value]):
                 own[first][rest] = value
             else:
                 shared[name] = value
-        for joint in joints:
-            if any(name.partition('.')[0] == joint for name in BY_NAME):
-                raise ParameterError(
-                    'joints', joint, 'is the first word of a parameter',
-                    'give the joint another name',
-                )
+        if taken := [joint for joint in joints if joint in {n.partition('.')[0] for n in BY_NAME}]:
+            raise ParameterError('joints', taken[0], 'is the first word of a parameter',
+                                 'give the joint another name')
         check_names(shared, joints)
-        checked = {
-            name: check_value(p, shared[name]) if name in shared else p.default
-            for name, p in BY_NAME.items()
-        }
+        checked = {name: check_value(p, shared[name]) if name in shared else p.default
+                   for name, p in BY_NAME.items()}
         tree = filled(ParameterTree, checked)
         if NOISE not in shared:
             # Whoever simulates noise means the estimator to know it, unless told otherwise.

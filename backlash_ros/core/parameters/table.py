@@ -21,8 +21,8 @@ NOISE = 'estimator.output_noise_std'
 of_both = partial(option, used_by=(CONTROLLER, PLANT))
 simulated = partial(option, used_by=(PLANT,))
 of_reference = partial(option, used_by=(REFERENCE_NODE,))
-of_node = partial(option, per_node=True, fixed=True)
-silence = partial(option, unit='s', low=0.0, high=3600.0, live=True, per_node=True)
+of_node = partial(option, per_node=True, change='never')
+silence = partial(option, unit='s', low=0.0, high=3600.0, change='live', per_node=True)
 
 
 @dataclass(frozen=True)
@@ -69,23 +69,22 @@ class EstimateBounds:
 class EstimatorOptions:
     law: str = option(
         'moving_horizon', 'law that learns m, c_r, c_l; kalman: a former name of moving_horizon',
-        choices=('moving_horizon', 'kalman', 'lms', 'printed', 'fixed', 'gradient'),
-        aliases=(('kalman', 'moving_horizon'),))
+        choices=('moving_horizon', 'kalman=moving_horizon', 'lms', 'printed', 'fixed', 'gradient'))
     initial: InitialEstimate = InitialEstimate()
     bounds: EstimateBounds = EstimateBounds()
     output_noise_std: float = option(
         1e-05, 'standard deviation of the noise on y; where it is not given, that of the simulated '
-        'noise and quantum if there is any; not live for every law', 'y', low=0.0, live=True)
+        'noise and quantum if there is any; not live for every law', 'y', low=0.0, change='live')
     input_noise_std: float = option(
         0.0, 'moving_horizon: random walk of a slow disturbance of u per square root of a second; '
-        '0: learned where the data demand one', 'u', low=0.0, live=True)
+        '0: learned where the data demand one', 'u', low=0.0, change='live')
     drift_std: tuple[float, float, float] = option(
         (0.0, 0.0, 0.0), 'moving_horizon: random walk of m, c_r, c_l per square root of a second',
-        low=0.0, live=True)
+        low=0.0, change='live')
     use_applied_control: str = option(
         'auto', 'take v from applied_control instead of the own command; auto: as soon as the '
         'driver reports every sample, as long as it does, and where control.delay_samples is 0',
-        choices=('auto', 'true', 'false'), fixed=True)
+        choices=('auto', 'true', 'false'), change='never')
     lag: int = option(
         20, 'lms and printed: samples by which the reconstruction of u looks back', 'samples',
         low=10, high=1000)
@@ -95,9 +94,9 @@ class EstimatorOptions:
 class LmsSteps:
     step: float = option(
         1.0, 'step of the normalised LMS on (m, m c_r, m c_l)', low=0.0, high=2.0, above=True,
-        live=True)
+        change='live')
     step_f: float = option(
-        0.0, 'step of the normalised LMS on f, 0 keeps f', low=0.0, high=2.0, live=True)
+        0.0, 'step of the normalised LMS on f, 0 keeps f', low=0.0, high=2.0, change='live')
 
 
 @dataclass(frozen=True)
@@ -119,10 +118,10 @@ class TrackingWeights:
     input_weight: float = option(
         0.01, 'tracking, pole_placement: weight of the square of u less what holds y at the '
         'reference, in units of |G|^2 at a twentieth of the sampling rate', low=0.0, above=True,
-        live=True)
+        change='live')
     integral_weight: float = option(
         0.0, 'tracking: weight of the squared integral of y_m - y; 0, for none, suffices where the '
-        'law learns, as effective crossings take up a constant disturbance', low=0.0, live=True)
+        'law learns, as effective crossings take up a constant disturbance', low=0.0, change='live')
 
 
 @dataclass(frozen=True)
@@ -135,12 +134,12 @@ class PolePlacementFilter:
 class InverseOptions:
     caution: float = option(
         1.0, 'tracking: standard deviations by which the crossings are shrunk', low=0.0,
-        high=100.0, live=True)
+        high=100.0, change='live')
     direction_band: float = option(
-        0.0, 'u_d has turned only after coming back by more than this', 'u', low=0.0, live=True)
+        0.0, 'u_d has turned only after coming back by more than this', 'u', low=0.0, change='live')
     take_up_rate: float = option(
         inf, 'largest speed of v while it crosses the gap; in proportional also while it goes '
-        'over to a line that new estimates have moved', 'v/s', low=0.0, above=True, live=True)
+        'over to a line that new estimates have moved', 'v/s', low=0.0, above=True, change='live')
 
 
 @dataclass(frozen=True)
@@ -153,12 +152,12 @@ class FixedDoubt:
 class ControlLimits:
     delay_samples: int = of_both(
         0, 'samples between control and its effect', 'samples', low=0, high=100)
-    min: float = option(-inf, 'smallest v', 'v', live=True)
-    max: float = option(inf, 'largest v', 'v', live=True)
-    rate_max: float = option(inf, 'largest speed of v', 'v/s', low=0.0, above=True, live=True)
+    min: float = option(-inf, 'smallest v', 'v', change='live')
+    max: float = option(inf, 'largest v', 'v', change='live')
+    rate_max: float = option(inf, 'largest speed of v', 'v/s', low=0.0, above=True, change='live')
     acceleration_max: float = option(
         inf, 'largest acceleration of v, so that a stepper loses no steps; v brakes in time for '
-        'its bounds and for where it is to go', 'v/s^2', low=0.0, above=True, live=True)
+        'its bounds and for where it is to go', 'v/s^2', low=0.0, above=True, change='live')
     initial: float = option(
         inf, 'v that acts when the controller starts, where no applied_control tells it; .inf: '
         'not known', 'v')
@@ -181,7 +180,7 @@ class SavedEstimates:
         False, 'begin with the estimates in estimates.file, if it exists', per_node=True)
     save_period: float = option(
         10.0, 'time between two savings while running, 0 to save on request and at the end only',
-        's', low=0.0, high=86400.0, live=True, per_node=True)
+        's', low=0.0, high=86400.0, change='live', per_node=True)
 
 
 @dataclass(frozen=True)
@@ -213,16 +212,16 @@ class DriverMessages:
 
 @dataclass(frozen=True)
 class SimulatedBacklash:
-    m: float = simulated(1.3, 'simulated slope', 'u/v', low=0.0, above=True, live=True)
-    c_r: float = simulated(3.0, 'simulated right crossing', 'v', live=True)
-    c_l: float = simulated(-3.0, 'simulated left crossing', 'v', live=True)
+    m: float = simulated(1.3, 'simulated slope', 'u/v', low=0.0, above=True, change='live')
+    c_r: float = simulated(3.0, 'simulated right crossing', 'v', change='live')
+    c_l: float = simulated(-3.0, 'simulated left crossing', 'v', change='live')
     initial_u: float = simulated(0.0, 'simulated u held at the start', 'u')
     rate: tuple[float, float, float] = simulated(
-        (0.0, 0.0, 0.0), 'simulated wear of m, c_r, c_l', '1/s', live=True)
+        (0.0, 0.0, 0.0), 'simulated wear of m, c_r, c_l', '1/s', change='live')
     jump_time: float = simulated(
-        0.0, 'time at which backlash.jump is added', 's', low=0.0, live=True)
+        0.0, 'time at which backlash.jump is added', 's', low=0.0, change='live')
     jump: tuple[float, float, float] = simulated(
-        (0.0, 0.0, 0.0), 'simulated step of m, c_r, c_l', live=True)
+        (0.0, 0.0, 0.0), 'simulated step of m, c_r, c_l', change='live')
 
 
 @dataclass(frozen=True)
@@ -277,14 +276,14 @@ class ParameterTree:
     on_stop: str = option(
         'hold', 'last command at deactivation and at the end: v is held, set to zero as fast as '
         'control.rate_max allows (none: at once), or ramped to zero at control.rate_max, which '
-        'must be set then', choices=('hold', 'zero', 'ramp'), live=True, per_node=True)
+        'must be set then', choices=('hold', 'zero', 'ramp'), change='live', per_node=True)
     on_timeout: str = option(
         'hold', 'the same while plant_output is silent', choices=('hold', 'zero', 'ramp'),
-        live=True, per_node=True)
+        change='live', per_node=True)
     on_rival: str = option(
         'stand_down', 'what to do where another node published control before this one was '
         'activated: publish nothing until it is gone, or go on and report it',
-        choices=('stand_down', 'warn'), live=True, per_node=True)
+        choices=('stand_down', 'warn'), change='live', per_node=True)
     timeout: Timeouts = Timeouts()
     estimates: SavedEstimates = SavedEstimates()
     joints: tuple[str, ...] = of_node(
@@ -292,27 +291,27 @@ class ParameterTree:
         'commands in an array; empty for one loop')
     io: DriverMessages = DriverMessages()
     backlash: SimulatedBacklash = SimulatedBacklash()
-    output_noise_std: float = simulated(0.0, 'simulated noise on y', 'y', low=0.0, live=True)
+    output_noise_std: float = simulated(0.0, 'simulated noise on y', 'y', low=0.0, change='live')
     output_quantum: float = simulated(
-        0.0, 'simulated resolution of y, 0 for none', 'y', low=0.0, live=True)
+        0.0, 'simulated resolution of y, 0 for none', 'y', low=0.0, change='live')
     output_loss: float = simulated(
-        0.0, 'simulated share of y that never arrives', low=0.0, high=0.99, live=True)
-    input_disturbance: float = simulated(0.0, 'simulated constant added to u', 'u', live=True)
+        0.0, 'simulated share of y that never arrives', low=0.0, high=0.99, change='live')
+    input_disturbance: float = simulated(0.0, 'simulated constant added to u', 'u', change='live')
     truth: TruePlant = TruePlant()
     seed: int = simulated(1, 'seed of the simulated noise', low=0)
     samples: int = simulated(0, 'outputs to simulate, 0 for no end', low=0)
     waveform: str = of_reference(
         'sine', 'shape of y_m',
-        choices=('sine', 'step', 'square', 'triangle', 'multisine', 'chirp', 'file'), live=True)
-    amplitude: float = of_reference(10.0, 'amplitude of y_m', 'y_m', low=0.0, live=True)
+        choices=('sine', 'step', 'square', 'triangle', 'multisine', 'chirp', 'file'), change='live')
+    amplitude: float = of_reference(10.0, 'amplitude of y_m', 'y_m', low=0.0, change='live')
     frequency: float = of_reference(
-        12.6, 'frequency of y_m (chirp: the last one)', 'rad/s', low=0.0, above=True, live=True)
+        12.6, 'frequency of y_m (chirp: the last one)', 'rad/s', low=0.0, above=True, change='live')
     frequency_start: float = of_reference(
-        0.63, 'first frequency of a chirp', 'rad/s', low=0.0, above=True, live=True)
+        0.63, 'first frequency of a chirp', 'rad/s', low=0.0, above=True, change='live')
     sweep_time: float = of_reference(
-        10.0, 'duration of a chirp', 's', low=0.0, above=True, live=True)
-    bias: float = of_reference(0.0, 'constant added to y_m', 'y_m', live=True)
-    file: str = of_reference('', 'CSV with a row t,y_m per sample for waveform: file', live=True)
+        10.0, 'duration of a chirp', 's', low=0.0, above=True, change='live')
+    bias: float = of_reference(0.0, 'constant added to y_m', 'y_m', change='live')
+    file: str = of_reference('', 'CSV of rows t,y_m for waveform: file', change='live')
     storage: str = option(
         'mcap', 'format of the bag', choices=('mcap', 'sqlite3'), used_by=(RECORDER,))
     bag: str = option(
@@ -329,5 +328,4 @@ class ParameterTree:
         used_by=(BRINGUP,))
 
 
-PARAMETERS: tuple[Parameter, ...] = tuple(declared_in(ParameterTree))
-BY_NAME: dict[str, Parameter] = {parameter.name: parameter for parameter in PARAMETERS}
+BY_NAME: dict[str, Parameter] = {each.name: each for each in declared_in(ParameterTree)}

@@ -18,7 +18,7 @@ from backlash_ros.core.parameters import Parameters, check_value
 from backlash_ros.core.parameters.errors import UNTOLD, ParameterError
 from backlash_ros.core.parameters.parameter import Parameter, Value
 from backlash_ros.core.parameters.parameter_set import entry_of
-from backlash_ros.core.parameters.table import CONTROLLER, NODES, PARAMETERS
+from backlash_ros.core.parameters.table import BY_NAME, CONTROLLER, NODES
 
 
 class ParameterNode(Node):
@@ -64,7 +64,7 @@ def declare_parameters(node: Node, executable: str, reconfigurable: bool = False
         if name not in ('use_sim_time', 'start_type_description_service')
     }
     parameters = Parameters(given)
-    values = {p.name: parameters[p.name] for p in PARAMETERS if executable in p.used_by}
+    values = {p.name: parameters[p.name] for p in BY_NAME.values() if executable in p.used_by}
     if executable == CONTROLLER:
         # Of a joint's own parameters those that were given: all of them would be hundreds.
         values |= {
@@ -106,7 +106,7 @@ def let_parameters_change(
     def on_set(changes: list[RosParameter]) -> msg.SetParametersResult:
         for change in changes:
             entry = entry_of(change.name)
-            if entry is not None and not (entry.live or is_free()):
+            if entry is not None and not (entry.change == 'live' or is_free()):
                 return msg.SetParametersResult(successful=False, reason=(
                     f'{change.name} is read-only while the node is configured: deactivate it and '
                     'clean it up first'
@@ -132,7 +132,7 @@ def _description(entry: Parameter, name: str, reconfigurable: bool) -> msg.Param
         description=entry.description + (f' [{entry.unit}]' if entry.unit else ''),
         additional_constraints='one of ' + ', '.join(entry.choices) if entry.choices
         else entry.rules,
-        read_only=not (entry.live or (reconfigurable and not entry.fixed)),
+        read_only=entry.change not in ('live', *['unconfigured'] * reconfigurable),
     )
     bounds = {'from_value': entry.low, 'to_value': entry.high}
     if isinstance(entry.default, float) and isfinite(entry.high - entry.low):

@@ -30,7 +30,7 @@ from rclpy.utilities import remove_ros_args
 
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.parameter import as_yaml
-from backlash_ros.core.parameters.table import PARAMETERS
+from backlash_ros.core.parameters.table import BY_NAME
 from backlash_ros.middleware.loopback import prefer_loopback
 from backlash_ros.nodes.runtime.executor import Polled, PromptExecutor
 from backlash_ros.nodes.runtime.parameters import ParameterNode, complaints, declare_parameters
@@ -250,10 +250,11 @@ def _parse_plain_arguments(
 ) -> None:
     """Refuse what is no argument of ROS; print help where asked for."""
     about = ''.join(
-        f'\n{"*" if p.live else " "} {p.name}: {as_yaml(p.default)}\n      {p.description}'
+        f'\n{"* " if p.change == "live" else "  "}{p.name}: {as_yaml(p.default)}'
+        f'\n      {p.description}'
         + (f' [{p.unit}]' if p.unit else '')
         + (f' (one of {", ".join(p.choices)})' if p.choices else '')
-        for p in PARAMETERS if executable in p.used_by
+        for p in BY_NAME.values() if executable in p.used_by
     )
     OptionParser(
         executable, ': parameters are given as --ros-args -p NAME:=VALUE or --params-file FILE',
