@@ -18,7 +18,6 @@ import sys
 import time
 import warnings
 from collections import Counter
-from collections.abc import Iterator
 from contextlib import nullcontext
 from multiprocessing import Pool
 from pathlib import Path
@@ -29,7 +28,7 @@ os.environ.setdefault('OMP_NUM_THREADS', '1')
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 sys.path.insert(1, str(Path(__file__).resolve().parents[1]))
 
-from fault_loop.fault_sequences import Findings, Sequence, Without
+from fault_loop.fault_sequences import KINDS, Sequence
 from fault_loop.random_loop import PERIOD_S
 from reporting import ROOT, markdown_table, processors, text_table
 
@@ -39,36 +38,10 @@ MARK = re.compile(
 )
 SEQUENCES, FIRST_SEED = 20_000, 1
 SHOWN = 3  # findings of a kind in the report of one sequence
-KINDS = {
-    'outside': 'a command outside the limits that held at that moment',
-    'too_fast': 'a move beyond `control.rate_max`',
-    'jumps': 'a jump at the first command after an interruption',
-    'unbounded': 'u_d further from what y_m asks for than tracking.md says',
-    'broken': 'an exception',
-    'wrong': '*tracking* with an estimate off by more than five published deviations',
-    'wrong_inherited': 'the same in a loop that began with saved estimates of another plant',
-    'wrong_uncertain': 'the same where time constants of the true G differ by up to 15 %',
-    'wrong_without': '*tracking* with an estimate off by a fifth, laws without deviations',
-}
-WRONG = ('wrong', 'wrong_inherited', 'wrong_uncertain')
-AT_FAULT = {
-    Without.ERROR_OF_G: 'G off by up to 15 %',
-    Without.TOLD_NOISE: 'the noise level as told, a third or three times the true one',
-    Without.WRONG_READINGS: 'readings of a sensor that failed',
-    Without.EVENTS: 'interruptions, losses, changes',
-}
-STARTS = ('as told', 'estimates of another plant', 'G off')  # of these kinds
-CAUSES = (
-    'Every wrong *tracking* with its cause: the first of these without which the same sequence has '
-    'none (AT_FAULT in benchmarks/faults.py has them in that order):'
-)
 
 
 class Result(NamedTuple):
-    """What a sequence led to: the kinds of what was found, with the first of each.
-
-    cause: of a wrong estimate, '' as long as nobody has asked.
-    """
+    """What a sequence led to: the kinds of what was found, with the first of each."""
 
     seed: int
     loop: str
@@ -76,12 +49,6 @@ class Result(NamedTuple):
     commands: int
     claimed: bool
     found: dict[str, str]
-    cause: str = ''
-
-    @property
-    def wrong(self) -> str:
-        """Kind of a wrong estimate with deviations, '' for none."""
-        return next((kind for kind in WRONG if kind in self.found), '')
 
 
 def read_results(path: Path | None) -> list[Result]:
@@ -99,25 +66,16 @@ def play(seed: int) -> Result:
         p = sequence.p
         loop = f'{p.estimator.law}, {p.structure}'
         try:
-            findings = sequence.run()
+            found = sequence.run()
         except Exception as error:
             return Result(seed, loop, 0, 0, False, {'broken': repr(error)})
-    found = {kind: texts[0] for kind, texts in found_in(findings) if texts}
-    return Result(seed, loop, findings.samples, findings.commands, findings.claimed, found)
-
-
-def found_in(findings: Findings) -> Iterator[tuple[str, list[str]]]:
-    """What was found of each kind."""
-    for kind in KINDS:
-        if kind != 'broken':
-            yield kind, getattr(findings, kind)
+    first = {kind: texts[0] for kind, texts in found.items() if texts}
+    return Result(seed, loop, sequence.samples, sequence.commands, sequence.claimed, first)
 
 
 def show(seed: int) -> int:
     """Print what happens in a sequence, and what was found."""
-    sequence = Sequence(seed, print)
-    findings = sequence.run()
-    for kind, texts in found_in(findings):
+    for kind, texts in Sequence(seed, print).run().items():
         for text in texts[:SHOWN]:
             print(f'{kind}: {text}')
         if len(texts) > SHOWN:
@@ -125,41 +83,13 @@ def show(seed: int) -> int:
     return 0
 
 
-def with_cause(result: Result) -> Result:
-    """The same with the first without which nothing wrong is said to be learned."""
-    if not result.wrong or result.cause:
-        return result
-    with warnings.catch_warnings():
-        warnings.simplefilter('ignore')
-        for without, cause in AT_FAULT.items():
-            found = Sequence(result.seed, without=without).run()
-            if not any(getattr(found, kind) for kind in WRONG):
-                return result._replace(cause=cause)
-    return result._replace(cause='none of these: noise and motion of the loop')
-
-
 def rows_of(results: list[Result]) -> list[list[str]]:
-    """A line for each kind: how many sequences, and their seeds where no other table has them."""
+    """A line for each kind: how many sequences, and their seeds."""
     rows = []
     for kind, what in KINDS.items():
         seeds = [str(result.seed) for result in results if kind in result.found]
-        named = 'below' if kind in WRONG and seeds else ', '.join(seeds)
-        rows.append([what, str(len(seeds)), named])
+        rows.append([what, str(len(seeds)), ', '.join(seeds)])
     return rows
-
-
-def causes_of(results: list[Result]) -> list[list[str]]:
-    """A line for each cause of wrong estimates: how many sequences, and which."""
-    seeds: dict[tuple[int, str], list[str]] = {}
-    for result in results:
-        if result.wrong:
-            where = (WRONG.index(result.wrong), result.cause)
-            seeds.setdefault(where, []).append(str(result.seed))
-    ordered = sorted(seeds.items(), key=lambda item: (item[0][0], -len(item[1]), item[0][1]))
-    return [
-        [STARTS[kind], cause, str(len(which)), ', '.join(which)]
-        for (kind, cause), which in ordered
-    ]
 
 
 def summary(results: list[Result], first_seed: int) -> str:
@@ -177,8 +107,7 @@ def write_document(results: list[Result], first_seed: int) -> None:
     """Write the table between its marks."""
     text = DOCUMENT.read_text(encoding='utf-8')
     table = markdown_table(('found', 'sequences', 'seeds'), rows_of(results))
-    causes = markdown_table(('begins', 'cause', 'sequences', 'seeds'), causes_of(results))
-    made = f'{summary(results, first_seed)}\n\n{table}\n\n{CAUSES}\n\n{causes}\n'
+    made = f'{summary(results, first_seed)}\n\n{table}\n'
     DOCUMENT.write_text(MARK.sub(lambda mark: f'{mark[1]}{made}{mark[2]}', text), encoding='utf-8')
 
 
@@ -224,8 +153,6 @@ def main() -> int:
     print(summary(results, first))
     print(text_table(('found', 'sequences', 'seeds'), rows_of(results)))
     if arguments.write:
-        with Pool(arguments.processes) as pool:
-            results = pool.map(with_cause, results, chunksize=4)
         write_document(results, first)
     count = Counter(kind for result in results for kind in result.found)
     return int(any(count[kind] for kind in ('outside', 'too_fast', 'unbounded', 'broken')))

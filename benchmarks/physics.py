@@ -11,23 +11,20 @@ import argparse
 import os
 import re
 import sys
-from dataclasses import dataclass
-from math import isinf, nan
+from collections import Counter
+from math import isinf, isnan, nan
+from typing import NamedTuple
 
 os.environ.setdefault('OMP_NUM_THREADS', '1')
 
-import numpy as np
 from gears.gear_figures import draw_hysteresis
 from gears.gear_runs import (
     MOTIONS,
     PRESETS,
     Identified,
-    Run,
     close_loop,
-    coasting_way,
     identified,
-    inertia_ratio,
-    learning,
+    inertia,
     lost_motion,
     quasi_static,
     uncompensated,
@@ -38,12 +35,11 @@ from backlash_ros.core.estimate import Status
 
 DOCUMENT = ROOT / 'docs' / 'physics.md'
 IMAGES = ROOT / 'docs' / 'images'
-MARKS = r'(<!-- {}: made by benchmarks -->\n).*?(<!-- end -->)'
+MARKS = re.compile(r'(<!-- physics: made by benchmarks -->\n).*?(<!-- end -->)', re.DOTALL)
 REMOVED, OFF = 0.9, 0.1  # bounds: share that is removed, error of the gap under *tracking*
 
 
-@dataclass(frozen=True)
-class Source:
+class Source(NamedTuple):
     """One way to know v: the command, or the motor encoder. lost: motion lost behind it."""
 
     preset: str
@@ -52,19 +48,16 @@ class Source:
     identified: Identified
 
 
-@dataclass(frozen=True)
-class Loop:
+class Loop(NamedTuple):
     """A loop that learns: its error, gap over lost motion, worst of it under *tracking*, states."""
 
     error: float
     gap: float
     tracking_off: float
     states: str
-    problem: str = ''
 
 
-@dataclass(frozen=True)
-class Case:
+class Case(NamedTuple):
     """One motion of one preset. none: error without compensation."""
 
     preset: str
@@ -99,25 +92,18 @@ def judge(job: tuple[str, Source, Source]) -> Case:
 
 
 def _loop(source: Source, motion: str) -> Loop:
-    parameters, gear = source.identified.parameters, PRESETS[source.preset]
-    if parameters is None:
-        return Loop(nan, nan, nan, '', source.identified.refused)
+    one = source.identified
+    if one.parameters is None:
+        return Loop(nan, nan, nan, one.refused)
     try:
-        controller = learning(source.identified.found, parameters)
-        run = close_loop(gear, controller, motion, source.encoder)
+        run = close_loop(PRESETS[source.preset], one.controller, motion, source.encoder)
     except (ArithmeticError, ValueError) as error:
-        return Loop(nan, nan, nan, '', str(error))
+        return Loop(nan, nan, nan, str(error))
+    shares = Counter(run.status[run.first:].tolist())
     return Loop(
         run.error, float(run.gap[-1]) / source.lost, run.said_tracking_off_by(source.lost),
-        _states(run),
-    )
-
-
-def _states(run: Run) -> str:
-    states, counts = np.unique(run.status[run.first:], return_counts=True)
-    return ', '.join(
-        f'{Status(state).word} {count / counts.sum():.0%}'
-        for state, count in sorted(zip(states, counts, strict=True), key=lambda one: -one[1])
+        ', '.join(f'{Status(state).word} {count / shares.total():.0%}'
+                  for state, count in shares.most_common()),
     )
 
 
@@ -149,12 +135,12 @@ def rows_of(cases: list[Case]) -> list[list[str]]:
     rows = []
     for one in cases:
         gear = PRESETS[one.preset]
-        ratio = inertia_ratio(gear, one.motion)
+        ratio, coasts = inertia(gear, one.motion)
         row = [one.preset, one.motion, 'jumps' if isinf(ratio) else f'{ratio:.2g}',
-               f'{coasting_way(gear, one.motion):.2g}', f'{one.none / one.lost:.1%}']
+               f'{coasts:.2g}', f'{one.none / one.lost:.1%}']
         for loop in one.loops:
             row += [f'{loop.error / one.lost:.1%}', f'{one.removed(loop):.0%}', f'{loop.gap:.3f}',
-                    loop.problem or loop.states]
+                    loop.states]
         rows.append(row)
     return rows
 
@@ -166,7 +152,8 @@ def wrong(cases: list[Case]) -> list[list[str]]:
         for name, loop in zip(('command', 'motor encoder'), one.loops, strict=True):
             what = []
             if not one.removed(loop) >= REMOVED:
-                what.append(loop.problem or f'removes {one.removed(loop):.0%}')
+                what.append(loop.states if isnan(loop.error)
+                            else f'removes {one.removed(loop):.0%}')
             if loop.tracking_off > OFF:
                 what.append(f'says tracking with the gap off by {loop.tracking_off:.0%}')
             if what:
@@ -175,13 +162,6 @@ def wrong(cases: list[Case]) -> list[list[str]]:
                     name, '; '.join(what),
                 ])
     return rows
-
-
-def write(name: str, text: str) -> None:
-    """Put a table into the document."""
-    marks = re.compile(MARKS.format(name), re.DOTALL)
-    page = DOCUMENT.read_text()
-    DOCUMENT.write_text(marks.sub(lambda mark: mark[1] + text + mark[2], page))
 
 
 def main() -> None:
@@ -214,7 +194,8 @@ def main() -> None:
             f'Where less than {REMOVED:.0%} is removed, or *tracking* is said with the gap off by '
             f'more than {OFF:.0%}, on {machine()}:', markdown_table(header, bad),
         ])
-        write('physics', f'{text}\n')
+        page = DOCUMENT.read_text()
+        DOCUMENT.write_text(MARKS.sub(lambda mark: f'{mark[1]}{text}\n{mark[2]}', page))
 
 
 if __name__ == '__main__':

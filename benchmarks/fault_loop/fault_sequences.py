@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from enum import Enum, auto
 from math import isfinite
 
 import numpy as np
@@ -34,57 +32,40 @@ NEGLIGIBLE = 1e-3  # of m and of the gap: an error that is none, however small t
 WITHOUT = 0.2  # of m and of the gap: an error of laws without deviations that is wrong
 JUMP = 2.5  # usual moves of v in the first one after an interruption
 LEARNED_MOVES = 50  # commands from which it is known which moves are usual
-NOTHING = 'nothing yet'
 
 
-class Without(Enum):
-    """What a sequence may be played without, to tell what its findings are due to."""
-
-    NOTHING = auto()
-    ERROR_OF_G = auto()
-    TOLD_NOISE = auto()
-    WRONG_READINGS = auto()
-    EVENTS = auto()
-
-
-@dataclass
-class Findings:
-    """What went wrong in a sequence, a sentence each, by kind."""
-
-    outside: list[str] = field(default_factory=list)
-    too_fast: list[str] = field(default_factory=list)
-    jumps: list[str] = field(default_factory=list)
-    unbounded: list[str] = field(default_factory=list)
-    wrong: list[str] = field(default_factory=list)
-    wrong_uncertain: list[str] = field(default_factory=list)
-    wrong_inherited: list[str] = field(default_factory=list)
-    wrong_without: list[str] = field(default_factory=list)
-    commands: int = 0
-    samples: int = 0
-    claimed: bool = False  # whether a law with deviations has ever said that it has learned
+KINDS = {  # of what may be found
+    'outside': 'a command outside the limits that held at that moment',
+    'too_fast': 'a move beyond `control.rate_max`',
+    'jumps': 'a jump at the first command after an interruption',
+    'unbounded': 'u_d further from what y_m asks for than tracking.md says',
+    'broken': 'an exception',
+    'wrong': '*tracking* with an estimate off by more than five published deviations',
+    'wrong_inherited': 'the same in a loop that began with saved estimates of another plant',
+    'wrong_uncertain': 'the same where time constants of the true G differ by up to 15 %',
+    'wrong_without': '*tracking* with an estimate off by a fifth, laws without deviations',
+}
 
 
 class Sequence:
-    """One loop, and what happens to it. told: called with what happens, for a reader."""
+    """One loop, and what happens to it. told: called with what happens, for a reader.
 
-    def __init__(
-        self, seed: int, told: Callable[[str], None] = lambda text: None,
-        without: Without = Without.NOTHING,
-    ) -> None:
+    found: what went wrong, a sentence each, by kind. claimed: whether a law with deviations has
+    ever said that it has learned.
+    """
+
+    def __init__(self, seed: int, told: Callable[[str], None] = lambda text: None) -> None:
         self.rng = rng = np.random.default_rng([seed, 13])
-        self.findings = Findings()
-        self._told, self._without = told, without
+        self.found: dict[str, list[str]] = {kind: [] for kind in KINDS}
+        self.commands = self.samples = 0
+        self.claimed = False
+        self._told = told
         while True:
             try:
                 self.p, swing = parameters_of(rng)
                 break
             except ParameterError:
                 continue  # a plant that is refused
-        if without is Without.ERROR_OF_G:
-            self.p = self.p.replaced({'truth.scale_frequency': 1.0})
-        if without is Without.TOLD_NOISE:
-            noise = self.p.output_noise_std
-            self.p = self.p.replaced({'estimator.output_noise_std': noise})
         p = self.p
         self.actuator = Actuator()
         self.driver = Driver(
@@ -103,45 +84,39 @@ class Sequence:
         self._uninterrupted: Uninterrupted | None = None  # what would follow on it
         self._last: Estimate | None = None
         self._loop: object = None
-        self._lately = NOTHING  # what has happened last
+        self._lately = 'nothing yet'  # what has happened last
         self._bound = PromisedBound(p)
         inherited = None
         if rng.random() < 0.2:
             inherited = self._saved_elsewhere()
             self._foreign = True
             told(f'begins with saved estimates of another plant: {inherited}')
-        v = 0.0 if rng.random() < 0.5 else None
+        knows_v = rng.random() < 0.5
         self.controller = Controller(p, self.driver, inherited, self._sent, self._answered)
-        if v is not None:
-            self.controller.restart(inherited, v)
+        if knows_v:
+            self.controller.restart(inherited, 0.0)
         told(f'{p.estimator.law}, {p.structure}, truth {self.truth}')
 
-    def run(self) -> Findings:
-        """Play the sequence."""
+    def run(self) -> dict[str, list[str]]:
+        """Play the sequence; what was found."""
         rng, driver = self.rng, self.driver
-        samples = int(rng.integers(*SAMPLES))
+        self.samples = int(rng.integers(*SAMPLES))
         next_event = int(rng.integers(*PAUSE))
-        for tick in range(1, samples + 1):
+        for tick in range(1, self.samples + 1):
             if tick in self._stops:
                 self._stops.pop(tick)()
             if tick == next_event:
                 self._event(tick)
                 next_event = tick + int(rng.integers(*PAUSE))
             driver.advance()
-            y_m: float | None = driver.reference(tick * PERIOD_S)
-            if self._frozen is not None:
-                y_m = self._frozen
-            self.controller.run(y_m)
-        self.findings.samples = samples
-        self.findings.unbounded.extend(self._bound.exceeded())
-        return self.findings
+            y_m = driver.reference(tick * PERIOD_S)
+            self.controller.run(y_m if self._frozen is None else self._frozen)
+        self.found['unbounded'] += self._bound.exceeded()
+        return self.found
 
     def _event(self, tick: int) -> None:
         """Let something happen."""
-        rng = self.rng
-        what = str(rng.choice(EVENTS))
-        if self._without is Without.EVENTS:
-            return
+        what = str(self.rng.choice(EVENTS))
         self._told(f'{tick}: {what}')
         self._lately = what
         EVENTS_BY_NAME[what](self, tick)
@@ -151,23 +126,15 @@ class Sequence:
     def _fail_sensor(self, tick: int) -> None:
         sensor = self.driver.sensor
         fault = str(self.rng.choice(SENSOR_FAULTS))
-        sensor.fault = '' if self._without is Without.WRONG_READINGS else fault
+        sensor.fault = fault
         sensor.value = sensor.swing * float(self.rng.uniform(-1.0, 1.0))
         self._told(f'    {fault}')
         self._lately += f': {fault}'
         self._end_later(tick, lambda: setattr(sensor, 'fault', ''))
 
-    def _lose(self, tick: int) -> None:
-        self.driver.loses = True
-        self._end_later(tick, lambda: setattr(self.driver, 'loses', False))
-
-    def _lose_reports(self, tick: int) -> None:
-        self.driver.loses_reports = True
-        self._end_later(tick, lambda: setattr(self.driver, 'loses_reports', False))
-
-    def _repeat(self, tick: int) -> None:
-        self.driver.repeats = True
-        self._end_later(tick, lambda: setattr(self.driver, 'repeats', False))
+    def _let_driver(self, fault: str, tick: int) -> None:
+        setattr(self.driver, fault, True)
+        self._end_later(tick, lambda: setattr(self.driver, fault, False))
 
     def _stall(self, tick: int) -> None:
         self.controller.stalled_until = tick + int(self.rng.integers(2, 40))
@@ -271,20 +238,20 @@ class Sequence:
     # What is watched.
 
     def _sent(self, v: float, limits: Limits) -> None:
-        found, before = self.findings, self.actuator.v
+        before = self.actuator.v
         self._v_before = before
         if self._newcomer:
             # It cannot tell a v beyond its limits from a wrong report.
             before, self._newcomer = limits.go_on_from(before, None), False
-        found.commands += 1
+        self.commands += 1
         where = f'sample {self.driver.tick}: v {before:.6g} -> {v:.6g}, {limits}'
         beyond, beyond_before = (max(limits.low - x, x - limits.high, 0.0) for x in (v, before))
         slack = ROUNDING * (1.0 + abs(v))
         # Limits that have been narrowed are met as fast as the rate allows.
         if not isfinite(v) or beyond > max(beyond_before - limits.move, 0.0) + slack:
-            found.outside.append(where)
+            self.found['outside'].append(where)
         if not abs(v - before) <= limits.move * (1.0 + ROUNDING) + slack:
-            found.too_fast.append(where)
+            self.found['too_fast'].append(where)
 
     def _answered(self, step: ControlStep, renewed: bool) -> None:
         """Judge an answer. renewed: whether nothing was known of the plant before it."""
@@ -317,11 +284,11 @@ class Sequence:
             loop, p = self.controller.loop, self.controller.p
             asked = self._uninterrupted.command(step, loop.core, p.inverse.direction_band)
             if abs(v - asked) > rounding:
-                self.findings.jumps.append(f'{where} to {v:.6g}, uninterrupted to {asked:.6g}')
+                self.found['jumps'].append(f'{where} to {v:.6g}, uninterrupted to {asked:.6g}')
         elif self._moves >= LEARNED_MOVES and move > (
             JUMP * self._usual + _shift(before, step.estimate, v) + rounding
         ):
-            self.findings.jumps.append(f'{where}, usual {self._usual:.3g}')
+            self.found['jumps'].append(f'{where}, usual {self._usual:.3g}')
 
     def _judge(self, e: Estimate) -> None:
         if e.status is not Status.TRACKING or was_given(e):
@@ -329,7 +296,7 @@ class Sequence:
         m, c_r, c_l = self.truth
         gap = c_r - c_l
         if e.learned:
-            self.findings.claimed = True
+            self.claimed = True
             stds = [max(DEVIATIONS * std, NEGLIGIBLE * size)
                     for std, size in ((e.std_m, m), (e.std_c_r, gap), (e.std_c_l, gap))]
         else:
@@ -338,13 +305,12 @@ class Sequence:
                   zip((e.m, e.c_r, e.c_l), self.truth, stds, strict=True))
         if off <= 1.0:
             return
-        found = self.findings
-        kind = found.wrong if e.learned else found.wrong_without
+        kind = 'wrong' if e.learned else 'wrong_without'
         if e.learned and self._foreign:
-            kind = found.wrong_inherited
+            kind = 'wrong_inherited'
         elif e.learned and self.p.truth.scale_frequency != 1.0:
-            kind = found.wrong_uncertain
-        kind.append(
+            kind = 'wrong_uncertain'
+        self.found[kind].append(
             f'sample {self.driver.tick}, {off:.2g} times what is allowed: '
             f'm {e.m:.5g} ({m:.5g}) ± {e.std_m:.2g}, '
             f'c_r {e.c_r:.5g} ({c_r:.5g}) ± {e.std_c_r:.2g}, '
@@ -370,11 +336,7 @@ class Sequence:
 def _truth(p: Parameters) -> tuple[float, float, float]:
     """m, c_r, c_l as the controller may know them: the gain at rest of the true G is part of m."""
     ratio = _gain_at_rest(build_true_model(p)) / _gain_at_rest(build_model(p))
-    return (
-        p.backlash.m * ratio,
-        p.backlash.c_r,
-        p.backlash.c_l,
-    )
+    return p.backlash.m * ratio, p.backlash.c_r, p.backlash.c_l
 
 
 def _gain_at_rest(model: TransferFunction) -> float:
@@ -392,8 +354,10 @@ def _shift(before: Estimate, now: Estimate, v: float) -> float:
 
 
 EVENTS_BY_NAME: dict[str, Callable[[Sequence, int], None]] = {
-    'the sensor fails': Sequence._fail_sensor, 'outputs are lost': Sequence._lose,
-    'reports are lost': Sequence._lose_reports, 'outputs are repeated': Sequence._repeat,
+    'the sensor fails': Sequence._fail_sensor,
+    'outputs are lost': lambda self, tick: self._let_driver('loses', tick),
+    'reports are lost': lambda self, tick: self._let_driver('loses_reports', tick),
+    'outputs are repeated': lambda self, tick: self._let_driver('repeats', tick),
     'the controller is held up': Sequence._stall,
     'the driver is restarted': Sequence._restart_driver,
     'the clock is set': Sequence._step_clock,

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import islice
 from math import asin, inf, pi, sin
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,9 +37,9 @@ ATTEMPTS = {
     '': Options(), '--integrator no': Options(integrators=(False,)),
     '--integrator no --order 1-2': Options(orders=(1, 2), integrators=(False,)),
 }
-# Share of the rate, and times the duration: of further motions where the messages say to move more
-# slowly, at lower frequencies, or for longer.
-AT_FIRST, SLOWER = (1.0, 1.0), ((0.5, 2.0), (0.25, 2.0))
+# Share of the rate, and times the duration: of the motion, and of those where the messages say to
+# move more slowly, at lower frequencies, or for longer.
+PACES = ((1.0, 1.0), (0.5, 2.0), (0.25, 2.0))
 STROKES_S = 20.0  # of the motion for identification, at most 4000 samples
 SETTLING_S = 0.5  # at rest before a record
 PERIODS, FIRST = 4, 2  # of a motion, and those of them that do not count
@@ -56,36 +57,27 @@ def _triangle(phase: float) -> float:
     return 2.0 / pi * asin(max(-1.0, min(1.0, sin(phase))))
 
 
-def _trapezoid(phase: float) -> float:
-    """Moves in half of the time, rests in the other."""
-    return max(-1.0, min(1.0, 2.0 * _triangle(phase)))
-
-
 def _multisine(phase: float) -> float:
     parts = ((0.6, 1.0, 0.0), (0.3, 2.0, 1.0), (0.2, 3.0, 4.0))
     return sum(size * sin(times * phase + shift) for size, times, shift in parts) / 0.95
 
 
-# Shape, and frequency in units of that of the preset.
+# Shape, and frequency over that of the preset; the last one moves half of the time, and rests.
 MOTIONS: dict[str, tuple[Motion, float]] = {
-    'sine': (sin, 1.0),
-    'slow sine': (sin, 0.3),
-    'multisine': (_multisine, 0.7),
+    'sine': (sin, 1.0), 'slow sine': (sin, 0.3), 'multisine': (_multisine, 0.7),
     'triangle': (_triangle, 0.7),
-    'moves and rests': (_trapezoid, 0.5),
+    'moves and rests': (lambda phase: max(-1.0, min(1.0, 2.0 * _triangle(phase))), 0.5),
 }
 
 
 @dataclass(frozen=True)
 class Run:
-    """A closed loop. y: true load (N,), y_m: as it is to be followed (N,), v, motor, estimates."""
+    """A closed loop: true load, y_m as it is to be followed, motor, estimated gap, (N,) each."""
 
     y: Array
     y_m: Array
-    v: Array
     motor: Array
     gap: Array
-    std_gap: Array
     status: NDArray[np.int64]
     first: int  # sample from which it counts
 
@@ -97,18 +89,14 @@ class Run:
     def said_tracking_off_by(self, lost_motion: float) -> float:
         """Largest relative error of the gap while the state was tracking; 0 where it never was."""
         rows = self.status[self.first:] == Status.TRACKING
-        if not rows.any():
-            return 0.0
-        return float(np.abs(self.gap[self.first:][rows] / lost_motion - 1.0).max())
+        return float(np.abs(self.gap[self.first:][rows] / lost_motion - 1.0).max(initial=0.0))
 
 
 def quasi_static(gear: Gear) -> tuple[Array, Array, Array]:
     """One period of a slow motion to and fro: v, motor and load, (N,) each."""
-    gap, interval = gear.lost_motion, 0.05
-    physics = GearPhysics(gear)
-    rows = []
+    interval, physics, rows = 0.05, GearPhysics(gear), []
     for k in range(round(1.25 * QUASI_STATIC_S / interval)):
-        v = SWINGS * gap * _triangle(2.0 * pi * k * interval / QUASI_STATIC_S)
+        v = SWINGS * gear.lost_motion * _triangle(2.0 * pi * k * interval / QUASI_STATIC_S)
         physics.move_to(v)
         physics.advance(interval)
         rows.append((v, physics.motor, physics.load))
@@ -142,8 +130,7 @@ def record(gear: Gear, seconds: float = STROKES_S) -> tuple[Array, Array, Array]
     return v, motor, y
 
 
-@dataclass(frozen=True)
-class Identified:
+class Identified(NamedTuple):
     """What `identify --drive` finds within the limits, and the file that it writes.
 
     option: what it had to be told because nothing of use was found without. parameters: None where
@@ -162,56 +149,38 @@ class Identified:
             return f'refused: {self.refused}'
         return '; '.join(self.found.reasons) or 'of use'
 
+    @property
+    def controller(self) -> AdaptiveController:
+        """The controller that begins with the identified file."""
+        assert self.parameters is not None
+        return build_controller(self.parameters, as_estimate(self.found, self.parameters))
 
-def identified(
-    gear: Gear, encoder: bool, rate: float = 1.0, seconds: float = STROKES_S,
-    attempts: Mapping[str, Options] = ATTEMPTS, slower: Sequence[tuple[float, float]] = SLOWER,
-) -> Identified:
-    """Identify from v, or from the motor encoder; if it is not of use, again as told to.
 
-    rate: share of the largest speed of v at which it moves for that. slower: shares of that, and
-    times the seconds, at which it moves again where no attempt is of use.
-    """
+def limits_of(gear: Gear) -> dict[str, Value]:
+    """What is known of a gear before it is identified, as parameters."""
+    reach = gear.scale * gear.reach
+    return {'sample_period': gear.sample_period, 'control.min': -reach, 'control.max': reach,
+            'control.rate_max': gear.scale * gear.rate}
+
+
+def identified(gear: Gear, encoder: bool) -> Identified:
+    """Identify from v, or from the motor encoder; if it is not of use, again as told to."""
+    given = {**limits_of(gear), 'estimator.use_applied_control': 'true' if encoder else 'false'}
     results: list[Identified] = []
-    for share, longer in (AT_FIRST, *slower):
-        moved = record(replace(gear, rate=share * rate * gear.rate), longer * seconds)
-        for option, choice in attempts.items():
-            one = _identified(gear, moved, encoder, choice)
-            results.append(replace(one, option=told(share, option)))
-            if one.found.usable and not one.refused:
+    for pace, longer in PACES:
+        v, motor, y = record(replace(gear, rate=pace * gear.rate), longer * STROKES_S)
+        for option, choice in ATTEMPTS.items():
+            found = identify(motor if encoder else v, y, gear.sample_period, choice)
+            if encoder:
+                found = with_actuator(found, v)
+            told = f'{"" if pace == 1.0 else f"--rate {pace:.0%}"} {option}'.strip()
+            try:
+                results.append(Identified(found, told, identified_parameters(found, given)))
+            except ParameterError as error:
+                results.append(Identified(found, told, None, str(error)))
+            if found.usable and not results[-1].refused:
                 return results[-1]
     return next((one for one in results if one.parameters is not None), results[0])
-
-
-def told(share: float, option: str) -> str:
-    """What `identify` had to be told: a share of the rate, and one of ATTEMPTS."""
-    pace = '' if share == 1.0 else f'--rate {share:.0%}'
-    return f'{pace} {option}'.strip()
-
-
-def _identified(
-    gear: Gear, moved: tuple[Array, Array, Array], encoder: bool, choice: Options,
-) -> Identified:
-    """From one record (v, motor, load encoder), told one thing."""
-    v, motor, y = moved
-    reach = gear.scale * gear.reach
-    given: dict[str, Value] = {
-        'sample_period': gear.sample_period, 'control.min': -reach, 'control.max': reach,
-        'control.rate_max': gear.scale * gear.rate,
-        'estimator.use_applied_control': 'true' if encoder else 'false',
-    }
-    found = identify(motor if encoder else v, y, gear.sample_period, choice)
-    if encoder:
-        found = with_actuator(found, v)
-    try:
-        return Identified(found, '', identified_parameters(found, given))
-    except ParameterError as error:
-        return Identified(found, '', None, str(error))
-
-
-def learning(found: Identification, parameters: Parameters) -> AdaptiveController:
-    """The controller that begins with the identified file."""
-    return build_controller(parameters, as_estimate(found, parameters))
 
 
 def constant(
@@ -237,48 +206,39 @@ def close_loop(
     size = gear.scale * gear.swing
     reference = size * np.array([shape(2.0 * pi * frequency * period * k) for k in range(samples)])
     physics = GearPhysics(gear)
-    rows = np.zeros((samples, 6))
+    rows = np.zeros((samples, 4))
     applied: tuple[float, ...] = ()
     for k in range(samples):
         y, motor = physics.load, physics.motor
         step = controller.step(physics.load_encoder(), float(reference[k]), applied=applied)
         controller.refine()
         e = step.estimate
-        rows[k] = y, step.v, motor, e.c_r - e.c_l, np.hypot(e.std_c_r, e.std_c_l), e.status
+        rows[k] = y, motor, e.c_r - e.c_l, e.status
         physics.move_to(step.v)
         physics.advance(period)
         applied = (physics.motor_encoder(),) if encoder else ()
-    y, v, motor, gap, std, status = rows.T
-    delay = controller.structure.delay
-    due = np.concatenate([np.full(delay, reference[0]), reference])[:samples]
-    return Run(y, due, v, motor, gap, std, status.astype(int), round(first / frequency / period))
+    y, motor, gap, status = rows.T
+    due = np.append(np.full(controller.structure.delay, reference[0]), reference)[:samples]
+    return Run(y, due, motor, gap, status.astype(int), round(first / frequency / period))
 
 
 def uncompensated(gear: Gear, parameters: Parameters, motion: str) -> Run:
     """The loop that takes the gap for 0."""
-    m = parameters.estimator.initial.m
-    controller = constant(parameters, m, 0.0, 0.0, DOUBT)
+    controller = constant(parameters, parameters.estimator.initial.m, 0.0, 0.0, DOUBT)
     return close_loop(gear, controller, motion, False, CONSTANT_PERIODS, CONSTANT_FIRST)
 
 
-def inertia_ratio(gear: Gear, motion: str) -> float:
-    """Largest J |a| / friction of the load on a motion; inf where its speed jumps."""
+def inertia(gear: Gear, motion: str) -> tuple[float, float]:
+    """Largest J |a| / friction of the load on a motion, inf where its speed jumps; and the way that
+    the load would coast at its largest speed, over the gap.
+    """
     shape, times = MOTIONS[motion]
-    phase = np.linspace(0.0, 2.0 * pi, 2001)
-    a = np.gradient(np.gradient([shape(float(x)) for x in phase], phase), phase)
-    if np.abs(a).max() > JUMP:
-        return inf
-    w = 2.0 * pi * times * gear.frequency
-    return float(gear.total_inertia * np.abs(a).max() * w**2 * gear.swing / gear.friction)
-
-
-def coasting_way(gear: Gear, motion: str) -> float:
-    """Way that the load would coast at the largest speed of a motion, over the gap."""
-    shape, times = MOTIONS[motion]
-    phase = np.linspace(0.0, 2.0 * pi, 2001)
-    speed = np.abs(np.gradient([shape(float(x)) for x in phase], phase)).max()
-    speed *= 2.0 * pi * times * gear.frequency * gear.swing
-    return float(0.5 * gear.total_inertia * speed**2 / gear.friction / gear.gap)
+    w, phase = 2.0 * pi * times * gear.frequency, np.linspace(0.0, 2.0 * pi, 2001)
+    speed = np.gradient([shape(float(x)) for x in phase], phase)
+    a = np.abs(np.gradient(speed, phase)).max()
+    ratio = gear.total_inertia * a * w**2 * gear.swing / gear.friction
+    energy = 0.5 * gear.total_inertia * (np.abs(speed).max() * w * gear.swing) ** 2
+    return inf if a > JUMP else float(ratio), float(energy / gear.friction / gear.gap)
 
 
 def gear_of(inertia: float, bandwidth: float) -> Gear:

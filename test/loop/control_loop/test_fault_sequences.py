@@ -10,12 +10,13 @@ from fault_loop.fault_sequences import Sequence
 @pytest.mark.parametrize('seed', [2, 188, 6351, 13592, 15977, 17291])
 @pytest.mark.filterwarnings('ignore')
 def test_no_sequence_of_faults_breaks_a_limit_or_makes_v_jump(seed: int) -> None:
-    found = Sequence(seed).run()
-    assert found.commands > 0
-    assert [found.outside, found.too_fast, found.jumps, found.unbounded] == [[], [], [], []]
+    sequence = Sequence(seed)
+    found = sequence.run()
+    assert sequence.commands > 0
+    assert [found[kind] for kind in ('outside', 'too_fast', 'jumps', 'unbounded')] == [[]] * 4
 
 
 @pytest.mark.parametrize('seed', [113, 206, 269])
 @pytest.mark.filterwarnings('ignore')
 def test_saved_estimates_of_another_plant_are_never_said_to_track(seed: int) -> None:
-    assert Sequence(seed).run().wrong_inherited == []
+    assert Sequence(seed).run()['wrong_inherited'] == []

@@ -22,9 +22,7 @@ def test_identified_from_limits_alone_the_loop_removes_what_backlash_does(identi
     assert identified.parameters is not None
     lost = SERVO.lost_motion
     assert identified.found.gap == pytest.approx(lost, rel=0.05)
-    run = gear_runs.close_loop(
-        SERVO, gear_runs.learning(identified.found, identified.parameters), 'sine', periods=3
-    )
+    run = gear_runs.close_loop(SERVO, identified.controller, 'sine', periods=3)
     none = gear_runs.uncompensated(SERVO, identified.parameters, 'sine').error
     known = gear_runs.constant(identified.parameters, 1.0, 0.5 * lost, -0.5 * lost)
     best = gear_runs.close_loop(SERVO, known, 'sine', periods=2, first=1).error
