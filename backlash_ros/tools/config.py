@@ -17,14 +17,13 @@ import yaml
 from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core.parameters import Parameters, check_names, check_value
 from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.core.parameters.parameter import Parameter, Value
+from backlash_ros.core.parameters.parameter import Value
 from backlash_ros.core.parameters.parameter_set import entry_of
 from backlash_ros.core.parameters.table import BRINGUP, BY_NAME, CONTROLLER, NODES
 from backlash_ros.shipped import find_config
 from backlash_ros.tools.cli import InputError
 
 ANY = '**'
-EVERY_NODE = f'/{ANY}'
 
 
 class Section(NamedTuple):
@@ -53,31 +52,30 @@ class Setting(NamedTuple):
 
 @dataclass(frozen=True)
 class Configuration:
-    """A file with what the command line changes in it; axes: empty for a run without axes."""
+    """A file with what the command line changes in it.
+
+    axes: empty for a run without. joints: of one controller, empty for a file without.
+    """
 
     path: Path
     sections: Sequence[Section]
     settings: Sequence[Setting]
     seed: int | None
     axes: tuple[str, ...]
-
-    @property
-    def joints(self) -> tuple[str, ...]:
-        """The joints of one controller, empty for a file without."""
-        return () if self.axes else _listed(self.path, self.sections, 'joints')
+    joints: tuple[str, ...]
 
     def parameters(self, axis: str = '') -> Parameters:
         """Return the complete set of one loop: defaults, the file, then --set, then --seed.
 
         axis: one of the axes, or of the joints, empty only if there are none; raises InputError.
         """
-        joints = self.joints
-        if joints and axis not in joints:
+        if self.joints and axis not in self.joints:
             raise InputError(
-                f'{self.path}: holds the joints {", ".join(joints)} of one controller: choose '
-                f'one of them, like --axis {joints[0]}, or start `controller` with the file itself'
+                f'{self.path}: holds the joints {", ".join(self.joints)} of one controller: choose '
+                f'one of them, like --axis {self.joints[0]}, or start `controller` with the file '
+                'itself'
             )
-        return self.of_controller('' if joints else axis).of_joint(axis)
+        return self.of_controller('' if self.joints else axis).of_joint(axis)
 
     def of_controller(self, axis: str = '') -> Parameters:
         """Return the same for one controller, with what each of its joints has of its own."""
@@ -120,15 +118,13 @@ def read_configuration(
         if axis and axis not in (axes or joints):
             raise InputError(f'--set {axis}/{name}: {_no_such_axis(axis, axes or joints)}')
     for section in sections:
-        if section.axis and not section.is_for(*axes):
-            rule = f': {_no_such_axis(section.axis, axes)}'
-        elif axes and not section.is_for(*axes):
-            rule = (f' belongs to no axis: write /{ANY}/{section.node} for all axes or '
-                    f'/{axes[0]}/{section.node} for one')
-        else:
+        if section.is_for(*axes or ('',)):
             continue
+        rule = f': {_no_such_axis(section.axis, axes)}' if section.axis else (
+            f' belongs to no axis: write /{ANY}/{section.node} for all axes or '
+            f'/{axes[0]}/{section.node} for one')
         raise InputError(f'{path}: section {section.name!r}{rule}')
-    return Configuration(path, sections, parsed, seed, axes)
+    return Configuration(path, sections, parsed, seed, axes, () if axes else joints)
 
 
 def effective_parameters(
@@ -254,7 +250,7 @@ def _checked(name: str, values: Mapping[str, object], joints: Sequence[str]) -> 
         if node not in (ANY, *entry.used_by):
             raise ParameterError(
                 key, checked[key], f'is not a parameter of {node}',
-                f'put it under {EVERY_NODE} or /{entry.used_by[0]}',
+                f'put it under /{ANY} or /{entry.used_by[0]}',
             )
         if key == 'axes' and axis not in (ANY, ''):
             raise ParameterError(key, value, 'is for the whole run', f'put it under /{BRINGUP}')
@@ -264,12 +260,12 @@ def _checked(name: str, values: Mapping[str, object], joints: Sequence[str]) -> 
 def _address(name: str) -> tuple[str, str]:
     """Axis and node of the name of a section."""
     parts = name.removeprefix('/').split('/')
-    if name == EVERY_NODE:
+    if name == f'/{ANY}':
         return ANY, ANY
     axis, node = parts[0] if parts[1:] else '', parts[-1]
     if len(parts) <= 2 and (node in NODES or (node == ANY and axis not in ('', ANY))):
         return axis, node
-    known = [EVERY_NODE, *(f'/{node}' for node in NODES)]
+    known = [f'/{ANY}', *(f'/{node}' for node in NODES)]
     similar = [f'/{axis}/{node}' for node in (*NODES, ANY)] if axis else known
     near = difflib.get_close_matches(name, similar, n=1)
     cure = f': did you mean {near[0]}?' if near else \
@@ -278,15 +274,11 @@ def _address(name: str) -> tuple[str, str]:
 
 
 class _Dumper(yaml.SafeDumper):
-    """SafeDumper that writes each list on one line, and in full: rcl knows no aliases."""
-
-    def ignore_aliases(self, data: Any) -> bool:
-        return True
+    """SafeDumper that writes each list on one line."""
 
 
-for _sequence in (list, tuple):
-    _Dumper.add_representer(_sequence, lambda dumper, values: dumper.represent_sequence(
-        'tag:yaml.org,2002:seq', values, flow_style=True))
+_Dumper.add_representer(list, lambda dumper, values: dumper.represent_sequence(
+    'tag:yaml.org,2002:seq', values, flow_style=True))
 
 
 def write_config(parameters: Parameters, path: Path) -> None:
@@ -302,25 +294,26 @@ def config_text(parameters: Parameters) -> str:
     """
     common = [p for p in BY_NAME.values() if p.used_by != (BRINGUP,) and parameters[p.name] != ()]
     own = [p for p in BY_NAME.values() if p not in common and parameters[p.name] != p.default]
-    of_all = _tree(parameters, common)
+    of_all = _tree(parameters, (p.name for p in common))
     for joint in parameters.joints:
         of_joint = parameters.of_joint(joint)
         of_all[joint] = _tree(of_joint, (
-            p for p in common if CONTROLLER in p.used_by and not p.per_node
+            p.name for p in common if CONTROLLER in p.used_by and not p.per_node
             and of_joint[p.name] != parameters[p.name]
         ))
-    document = {EVERY_NODE: {'ros__parameters': of_all}}
+    document = {f'/{ANY}': {'ros__parameters': of_all}}
     if own:
-        document[f'/{BRINGUP}'] = {'ros__parameters': _tree(parameters, own)}
+        document[f'/{BRINGUP}'] = {'ros__parameters': _tree(parameters, (p.name for p in own))}
     return yaml.dump(document, Dumper=_Dumper, sort_keys=False, width=1000)
 
 
-def _tree(parameters: Parameters, written: Iterable[Parameter]) -> dict[str, Any]:
+def _tree(parameters: Parameters, names: Iterable[str]) -> dict[str, Any]:
     tree: dict[str, Any] = {}
-    for parameter in written:
-        *groups, leaf = parameter.name.split('.')
+    for name in names:
+        *groups, leaf = name.split('.')
         branch = tree
         for group in groups:
             branch = branch.setdefault(group, {})
-        branch[leaf] = parameters[parameter.name]
+        value = parameters[name]
+        branch[leaf] = list(value) if isinstance(value, tuple) else value
     return tree

@@ -14,7 +14,7 @@ from backlash_ros.core.identification.result import Details, Identification
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.parameter import Value
 from backlash_ros.core.parameters.table import BRINGUP, BY_NAME, PLANT
-from backlash_ros.tools.config import ANY, EVERY_NODE, config_text
+from backlash_ros.tools.config import ANY, config_text
 
 # Parameters of the file that the user gave which do not go on: of the simulation, of one run.
 NOT_TAKEN_OVER = (
@@ -219,6 +219,6 @@ def commented_yaml(
         lines.append(line)
     text = '\n'.join([*lines, ''])
     if axis:
-        text = text.replace(f'\n{EVERY_NODE}:', f'\n/{axis}/{ANY}:')
+        text = text.replace(f'\n/{ANY}:', f'\n/{axis}/{ANY}:')
         text += f"/{BRINGUP}:\n  ros__parameters:\n    axes: ['{axis}']\n"
     return text

@@ -16,23 +16,24 @@ from rosbags.typesys import Stores, get_typestore
 
 from backlash_ros import topics
 from backlash_ros.bags.reader import REPAIR_COMMAND, BagError, BagReader, Topic
-from backlash_ros.core.loop.learned_model import from_fields
+from backlash_ros.core.loop.learned_model import LearnedModel, from_fields
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 from backlash_ros.tools.cli import WHOLE_SPAN, InputError, Span
 from backlash_ros.tools.runs.files import Run
 
 Array = NDArray[np.float64]
+Messages = list[tuple[int, Any]]  # with their stamps [ns], in the order of these
 # Messages of an array topic by label, shape (N,) each, and their `stamp` [ns] since the first.
 Table = dict[str, Array]
 
 
 class Content(NamedTuple):
-    """Stamps [ns] and messages of the wanted topics by recorded name, in the order of stamps.
+    """Messages of the wanted topics by recorded name.
 
     names: of all topics of the bag. damage: what is wrong with it and the cure, '' for nothing.
     """
 
-    messages: dict[str, list[tuple[int, Any]]]
+    messages: dict[str, Messages]
     names: set[str]
     damage: str
 
@@ -40,7 +41,7 @@ class Content(NamedTuple):
 def read_topics(path: Path, wanted: Callable[[Topic], bool]) -> Content:
     """Decode the wanted topics of a bag, or what is left of them; raises InputError."""
     types = get_typestore(Stores.ROS2_JAZZY)
-    found: dict[str, list[tuple[int, Any]]] = {}
+    found: dict[str, Messages] = {}
     garbled, damage = 0, ''
     try:
         reader = BagReader(path)
@@ -84,6 +85,11 @@ def choose_namespace(names: Sequence[str], axis: str) -> tuple[str, str]:
     )
 
 
+def topic_ends_like(name: str, topic: str) -> bool:
+    """Whether a recorded topic is this one, in whatever namespace."""
+    return f'/{name}'.endswith(f'/{topic}')
+
+
 def read_reports(path: Path, y: Array, axis: str = '') -> list[list[float]]:
     """What applied_control reported between each output of a run and the one before it.
 
@@ -91,11 +97,9 @@ def read_reports(path: Path, y: Array, axis: str = '') -> list[list[float]]:
     bag holds no applied_control, or the outputs are not all there. Raises InputError.
     """
     content = read_topics(path, lambda topic: topic.message_type == 'std_msgs/msg/Float64')
-    outputs, reports = (
-        content.messages.get(choose_namespace(sorted(
-            name for name in content.messages if f'/{name}'.endswith(f'/{topic}')
-        ), axis)[0], []) for topic in (topics.PLANT_OUTPUT, topics.APPLIED_CONTROL)
-    )
+    outputs, reports = (content.messages.get(choose_namespace(
+        sorted(name for name in content.messages if topic_ends_like(name, topic)), axis,
+    )[0], []) for topic in (topics.PLANT_OUTPUT, topics.APPLIED_CONTROL))
     stamps: list[int] = []
     remaining = iter(outputs)
     for value in y.tolist():
@@ -122,7 +126,10 @@ def read_bag(
     content = read_topics(path, lambda topic: topic.name.rpartition('/')[2] in last_parts
                           and topic.message_type == 'std_msgs/msg/Float64MultiArray')
     try:
-        tables, models, notes = _find_tables(content, axis)
+        found, prefix, notes = _of_axis(content, axis)
+        models = found.pop(topics.MODEL)
+        begin_ns = found[topics.SIGNALS][0][0]
+        tables = [_tabulate(*each, prefix, begin_ns) for each in found.items()]
         restarted = _choose_section(tables, span)
         signals, estimates, truth = tables
         if not signals['stamp'].size:
@@ -137,10 +144,8 @@ def read_bag(
             sample_period = 1e-9 * float(np.median(steps)) if steps.size else 0.0
             if not sample_period > 0.0:
                 raise InputError('its stamps do not show the sample period: give --config')
-            notes.append(
-                f'the sample period of {sample_period:.6g} s was taken from the stamps of the bag, '
-                'as no parameters were given'
-            )
+            notes.append(f'the sample period of {sample_period:.6g} s was taken from the stamps of '
+                         'the bag, as no parameters were given')
     except InputError as error:
         raise InputError('; '.join(filter(None, (f'{path}: {error}', content.damage)))) from None
     columns = {
@@ -150,71 +155,55 @@ def read_bag(
     columns |= _true_columns(columns['v'], count, truth)
     heard = np.union1d(signals['sample'], estimates['sample'])
     if heard.size > count.size:
-        notes.append(
-            f'{heard.size - count.size} samples were left out: only one of signals and estimates '
-            'is in the bag'
-        )
-    unknown, learned = np.full(count.size, np.nan), None
-    with suppress(KeyError, IndexError, ValueError):  # where it was not complete
-        learned = from_fields([
-            fields for stamp, fields in models
-            if signals['stamp'][0] <= stamp < span.to_s * 1e9
-        ][-1])
+        notes.append(f'{heard.size - count.size} samples were left out: only one of signals and '
+                     'estimates is in the bag')
+    unknown = np.full(count.size, np.nan)
     record = RunRecord(
         np.column_stack([columns.get(name, unknown) for name in COLUMNS]), sample_period,
-        int(heard[-1] - heard[0]) + 1 - heard.size, learned,
+        int(heard[-1] - heard[0]) + 1 - heard.size,
+        _newest_model([message for stamp, message in models
+                       if signals['stamp'][0] <= stamp - begin_ns < span.to_s * 1e9], prefix),
     )
     notes = [content.damage, *notes, restarted]
     return Run(record, None, columns['latency_s'], tuple(filter(None, notes)))
 
 
-def _find_tables(
-    content: Content, axis: str,
-) -> tuple[list[Table], list[tuple[float, dict[str, list[float]]]], list[str]]:
-    """Signals, estimates and truth of one axis or joint, G with its stamps, what else is there."""
-    first = content.messages.get(choose_namespace(_names_of(content, topics.SIGNALS), '')[0], [])
-    labels = _labels(first[0][1]) if first else []
-    joints = list(dict.fromkeys(label.rpartition('.')[0] for label in labels if '.' in label))
-    prefix, notes = '', []
-    if joints and axis in ('', *joints):
-        joint = axis or joints[0]
-        if not axis and joints[1:]:
-            notes = [f'this is joint {joint}; --axis chooses one of {", ".join(joints[1:])}']
-        prefix, axis = f'{joint}.', ''
-    begin_ns, found = 0, {}
-    for topic in topics.LABELS_OF:  # signals first
-        name, note = choose_namespace(_names_of(content, topic), axis)
-        found[topic] = content.messages.get(name, [])
-        if topic == topics.SIGNALS and name:
-            begin_ns = found[topic][0][0]
-            if note:
-                notes.append(note)
-                axis = name.strip('/').split('/')[0]
+def _of_axis(content: Content, axis: str) -> tuple[dict[str, Messages], str, list[str]]:
+    """The messages of one axis by topic; the prefix of its labels if it is a joint; notes."""
+    found: dict[str, Messages] = {}
+    prefix, notes = '', list[str]()
+    for topic, labels in topics.LABELS_OF.items():  # signals first
+        # Nodes that were renamed are known by their labels.
+        names = sorted(
+            name for name, messages in content.messages.items() if topic_ends_like(name, topic)
+            or (name.rpartition('/')[2] == topic.rpartition('/')[2]
+                and set(labels) <= set(_labels(messages[0][1])))
+        )
+        if topic == topics.SIGNALS and names:
+            joints = list(dict.fromkeys(
+                label.partition('.')[0] for label in _labels(content.messages[names[0]][0][1])
+                if '.' in label))
+            if joints and axis in ('', *joints):
+                if not axis and joints[1:]:
+                    notes = [f'this is joint {joints[0]}; --axis chooses one of '
+                             f'{", ".join(joints[1:])}']
+                prefix, axis = f'{axis or joints[0]}.', ''
+        name, note = choose_namespace(names, axis)
         if not name and topic in (topics.SIGNALS, topics.ESTIMATES):
             of_axis = f' of axis {axis}' if axis else ''
             raise InputError(f'holds no message of {topic}{of_axis}; its topics are '
                              f'{", ".join(sorted(content.names)) or "none"}')
-    models = [(float(stamp - begin_ns), _fields_of(message, prefix))
-              for stamp, message in found.pop(topics.MODEL)]
-    # Of a joint that was not answered there is nothing but nan.
-    known = [each for each in models if not all(map(isnan, chain(*each[1].values())))]
-    return [_tabulate(*each, prefix, begin_ns) for each in found.items()], known, notes
+        if note:
+            axis, notes = name.strip('/').split('/')[0], [*notes, note]
+        found[topic] = content.messages.get(name, [])
+    return found, prefix, notes
 
 
 def _labels(message: Any) -> list[str]:
     return [each.label for each in message.layout.dim]
 
 
-def _names_of(content: Content, topic: str) -> list[str]:
-    """Under which names a topic was recorded; nodes that were renamed stand behind the others."""
-    last, wanted = topic.rpartition('/')[2], set(topics.LABELS_OF[topic])
-    return sorted((
-        name for name, messages in content.messages.items() if f'/{name}'.endswith(f'/{topic}')
-        or (name.rpartition('/')[2] == last and wanted <= set(_labels(messages[0][1])))
-    ), key=lambda name: (not f'/{name}'.endswith(f'/{topic}'), name))
-
-
-def _tabulate(topic: str, messages: Sequence[tuple[int, Any]], prefix: str, begin_ns: int) -> Table:
+def _tabulate(topic: str, messages: Messages, prefix: str, begin_ns: int) -> Table:
     """The messages of a topic, of several joints what is about the one with this prefix."""
     if not messages:  # a real plant does not know its truth
         return {label: np.empty(0) for label in (*topics.LABELS_OF[topic], 'stamp')}
@@ -245,9 +234,8 @@ def _choose_section(tables: list[Table], span: Span) -> str:
     # In lockstep the stamp is that of the newest tick that the recorder had heard: what belongs to
     # the first signals may be stamped before them.
     begin = span.from_s * 1e9 if span.from_s > 0.0 else -np.inf
-    for i, table in enumerate(tables):
-        t = table['stamp']
-        tables[i] = _rows(table, (t >= begin) & (t < span.to_s * 1e9))
+    tables[:] = [_rows(table, (table['stamp'] >= begin) & (table['stamp'] < span.to_s * 1e9))
+                 for table in tables]
     signals, note = tables[0], ''
     restarts = np.flatnonzero(np.diff(signals['sample']) <= 0) + 1
     # Where the count falls back that often, two nodes are at work.
@@ -280,7 +268,7 @@ def _true_columns(v: Array, count: Array, truth: Table) -> Table:
         sample_of = dict(zip(truth['v'].tolist(), sample.tolist(), strict=True))
         offsets = Counter(k - sample_of[value] for k, value in zip(count, v.tolist(), strict=True)
                           if value in sample_of)
-        sample = sample + (offsets.most_common(1)[0][0] if offsets else 0)
+        sample = sample + max(offsets, key=offsets.__getitem__, default=0)
     _, here, there = np.intersect1d(count, sample, assume_unique=True, return_indices=True)
     u = np.full(count.size, np.nan)
     u[here] = truth['u'][there]
@@ -288,9 +276,15 @@ def _true_columns(v: Array, count: Array, truth: Table) -> Table:
     return {'u': u, **{f'true_{name}': truth[name][newest] for name in topics.BACKLASH}}
 
 
-def _fields_of(message: Any, prefix: str) -> dict[str, list[float]]:
-    """What a message tells of G, of several joints what is about the one with this prefix."""
-    ends = np.cumsum([each.size for each in message.layout.dim])
-    parts = zip(_labels(message), np.split(message.data, ends), strict=False)
-    return {label.removeprefix(prefix): values.tolist() for label, values in parts
-            if label.startswith(prefix)}
+def _newest_model(messages: Sequence[Any], prefix: str) -> LearnedModel | None:
+    """The last G that was told, of a joint that was answered; None where it was not complete."""
+    for message in reversed(messages):
+        ends = np.cumsum([each.size for each in message.layout.dim])
+        parts = zip(_labels(message), np.split(message.data, ends), strict=False)
+        fields = {label.removeprefix(prefix): values.tolist() for label, values in parts
+                  if label.startswith(prefix)}
+        if not all(map(isnan, chain(*fields.values()))):
+            with suppress(KeyError, IndexError, ValueError):
+                return from_fields(fields)
+            return None
+    return None

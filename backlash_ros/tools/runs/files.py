@@ -130,22 +130,18 @@ def read_samples(path: Path, sample_period: float | None = None) -> RunRecord:
     sample_period: None takes the smallest distance of two rows. Raises InputError.
     """
     try:
-        header, *lines = path.read_text(encoding='utf-8').splitlines() or ['']
-    except (OSError, UnicodeDecodeError) as error:
+        with path.open(encoding='utf-8') as file:
+            names = tuple(file.readline().strip().split(','))
+            cells = np.array([[float(cell or 'nan') for cell in row] for row in csv.reader(file)])
+    except (OSError, ValueError) as error:
         raise InputError(f'{path}: cannot be read: {error}') from None
-    names = tuple(header.split(','))
     # It once ended with f.
     if names not in (SAMPLE_COLUMNS, SAMPLE_COLUMNS[:10]):
         raise InputError(f'{path}: line 1: must be the header {",".join(SAMPLE_COLUMNS)}')
-    if not lines:
-        raise InputError(f'{path}: holds no sample')
-    rows = np.full((len(lines), len(COLUMNS)), np.nan)
-    places = [COLUMNS.index(name) for name in names]
-    for i, line in enumerate(lines):
-        try:
-            rows[i, places] = [float(cell or 'nan') for cell in line.split(',')]
-        except ValueError:
-            raise InputError(f'{path}: line {i + 2}: must hold {len(names)} numbers') from None
+    if cells.shape[1:] != (len(names),):
+        raise InputError(f'{path}: must hold rows of {len(names)} numbers')
+    rows = np.full((len(cells), len(COLUMNS)), np.nan)
+    rows[:, [COLUMNS.index(name) for name in names]] = cells
     t = rows[:, COLUMNS.index('t')]
     steps = np.diff(t)
     if falls := np.flatnonzero(~(steps > 0.0)).tolist():

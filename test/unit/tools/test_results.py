@@ -120,9 +120,9 @@ def test_file_is_replaced_whole_or_not_at_all(tmp_path: Path) -> None:
 @pytest.mark.parametrize(('text', 'message'), [
     ('', 'line 1: must be the header'),
     ('a,b\n1,2\n', 'line 1: must be the header'),
-    (f'{OLD_HEADER}\n', 'holds no sample'),
-    (f'{OLD_HEADER}\n0,1\n', 'line 2: must hold 10 numbers'),
-    (f'{OLD_HEADER}\n0,1,1,1,1,x,1,1,1,1\n', 'line 2: must hold 10 numbers'),
+    (f'{OLD_HEADER}\n', 'must hold rows of 10 numbers'),
+    (f'{OLD_HEADER}\n0,1\n', 'must hold rows of 10 numbers'),
+    (f'{OLD_HEADER}\n0,1,1,1,1,x,1,1,1,1\n', "could not convert string to float: 'x'"),
     (f'{OLD_HEADER}\n' + '0,1,1,1,1,1,1,1,1,1\n' * 2, 'line 3: t must rise'),
     (f'{OLD_HEADER}\n0,1,1,1,1,1,1,1,1,1\n', 'needs two samples'),
 ])
