@@ -13,12 +13,11 @@ from concurrent.futures import FIRST_COMPLETED, CancelledError, ProcessPoolExecu
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from importlib.metadata import version
-from math import inf, nan
+from math import inf
 from typing import NamedTuple
 
 import numpy as np
 import yaml
-from scipy.special import chdtri
 from tqdm import tqdm
 
 from backlash_ros.core.parameters import Parameters, check_names, check_value
@@ -26,7 +25,13 @@ from backlash_ros.core.parameters.parameter import Value
 from backlash_ros.core.parameters.table import BY_NAME
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.metrics import SETTLING_TOLERANCE
-from backlash_ros.tools.cli import BrokenOffError, InputError, StopRequests, number_of_samples
+from backlash_ros.tools.cli import (
+    ONE_THREAD,
+    BrokenOffError,
+    InputError,
+    StopRequests,
+    number_of_samples,
+)
 from backlash_ros.tools.runs.read_run import run_loop
 from backlash_ros.tools.runs.summary import summarise
 from backlash_ros.topics import BACKLASH
@@ -55,9 +60,7 @@ class Job(NamedTuple):
 class ParameterStatistics(NamedTuple):
     """Statistics of one estimated parameter over runs.
 
-    settling times [s]: inf for never. within: share of runs within 1 % at the end. nees: mean of
-    (error / std)^2, nan without standard deviations; honest ones put it into nees_interval with
-    95 %.
+    settling times [s]: inf for never. within: share of runs within 1 % at the end.
     """
 
     bias: float
@@ -65,8 +68,6 @@ class ParameterStatistics(NamedTuple):
     settling_median: float
     settling_max: float
     within: float
-    nees: float
-    nees_interval: tuple[float, float]
 
 
 def combinations(texts: Sequence[str]) -> list[dict[str, Value]]:
@@ -148,9 +149,7 @@ def run_jobs(
 
 def _in_processes(jobs: Sequence[Job], workers: int) -> Generator[tuple[int, Outcome], None, None]:
     """Number and outcome of each job, as they come."""
-    # The matrices are tiny: threads of the linear algebra would only disturb the other processes.
-    # It is read when a worker imports numpy.
-    os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1', MKL_NUM_THREADS='1')
+    os.environ.update(ONE_THREAD)  # read when a worker imports numpy
     executor = ProcessPoolExecutor(
         workers, multiprocessing.get_context('spawn'), initializer=_end_with_parent
     )
@@ -259,21 +258,15 @@ def statistics(outcomes: Sequence[Outcome]) -> dict[str, ParameterStatistics]:
     whole = [outcome for outcome in outcomes if not outcome['problem']]
     if not whole:
         raise InputError(f'every run broke off, the first one with: {outcomes[0]["problem"]}')
-    n, found = len(whole), {}
-    # Quantiles of chi squared with n degrees of freedom: n times the mean has that distribution.
-    low, high = chdtri(n, [0.975, 0.025]) / n
+    found = {}
     for name in BACKLASH:
-        final, std, truth, settling = (
-            np.array([one[f'{prefix}{name}'] for one in whole], dtype=float)
-            for prefix in OUTCOME_GROUPS
-        )
+        final, truth, settling = (np.array([one[f'{prefix}{name}'] for one in whole], dtype=float)
+                                  for prefix in ('', 'true_', 'settling_'))
         error, settling = final - truth, np.sort(np.where(np.isnan(settling), inf, settling))
-        known = bool(np.all(np.isfinite(std) & (std > 0.0)))
         found[name] = ParameterStatistics(
             float(error.mean()), float(np.sqrt(np.mean(error**2))),
             # The median of a number and "never" is never, not the nan of inf - inf.
-            float(settling[n // 2]), float(settling[-1]),
+            float(settling[len(whole) // 2]), float(settling[-1]),
             float(np.mean(np.abs(error) <= SETTLING_TOLERANCE * np.abs(truth))),
-            float(np.mean((error / std) ** 2)) if known else nan, (float(low), float(high)),
         )
     return found

@@ -17,7 +17,7 @@ from backlash_ros.core.parameters.parameter import Value, as_yaml
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.options import OptionParser
 from backlash_ros.tools import batch, cli
-from backlash_ros.tools.batch import OUTCOME_COLUMNS, Job, Outcome, statistics
+from backlash_ros.tools.batch import OUTCOME_COLUMNS, Outcome, statistics
 from backlash_ros.tools.cli import NOTHING, InputError, format_table
 from backlash_ros.tools.config import effective_parameters, write_config
 from backlash_ros.tools.runs.files import CONFIG_FILE, Run, result_directory, write_table
@@ -63,9 +63,9 @@ def _once(parameters: Parameters, options: argparse.Namespace) -> None:
     directory = result_directory(options.out)
     print(estimate_table(write_report(Run(run, parameters), directory)))
     law = loop.controller.estimator
-    state = state_beside(set(), LoopFigures(
-        sample_period=parameters.sample_period, status=law.estimate.status, law=law.report))
     if law.estimate.status != Status.TRACKING:
+        state = state_beside(set(), LoopFigures(
+            sample_period=parameters.sample_period, status=law.estimate.status, law=law.report))
         print(f'at the end: {state.text}')
     print(f'report: {directory / REPORT_PAGE}')
 
@@ -95,12 +95,24 @@ def _many(parameters: Parameters, options: argparse.Namespace) -> None:
     ])
     size = len(outcomes) // len(changes)  # the jobs of one change stand together
     print(_table(changes, [outcomes[i * size:][:size] for i in range(len(changes))]))
-    _print_shortfalls(jobs, outcomes)
+    ended = [(job.values['seed'], outcome) for job, outcome in zip(jobs, outcomes, strict=True)]
+    for what, of in (
+        ('broke off', [(seed, each['problem']) for seed, each in ended if each['problem']]),
+        ('not within 1 % at the end', [
+            (seed, '') for seed, each in ended if not each['problem']
+            and any(each[f'settling_{name}'] is None for name in BACKLASH)
+        ]),
+    ):
+        if of:
+            named = list(dict.fromkeys(str(seed) for seed, _ in of))
+            shown = ', '.join(named[:10]) + (', ...' if len(named) > 10 else '')
+            why = f', the first one with: {of[0][1]}' if of[0][1] else ''
+            print(f'{what}: {len(of)} run{"s" if len(of) > 1 else ""}, seed {shown}{why}')
     print(f'runs: {csv}')
 
 
 def _table(changes: Sequence[Mapping[str, Value]], groups: Sequence[Sequence[Outcome]]) -> str:
-    """Statistics of each parameter over the runs of each change; NEES: with its interval of 95 %.
+    """Statistics of each parameter over the runs of each change.
 
     Raises InputError where all runs of the only change broke off.
     """
@@ -108,30 +120,14 @@ def _table(changes: Sequence[Mapping[str, Value]], groups: Sequence[Sequence[Out
     for change, outcomes in zip(changes, groups, strict=True):
         swept = list(map(as_yaml, change.values()))
         if len(changes) > 1 and all(outcome['problem'] for outcome in outcomes):
-            rows.append([*swept, 'broke off', *[NOTHING] * 6])
+            rows.append([*swept, 'broke off', *[NOTHING] * 5])
             continue
         rows += [[
             *swept, name, f'{s.bias:+.3g}', f'{s.rmse:.3g}', _seconds(s.settling_median),
             _seconds(s.settling_max), f'{100.0 * s.within:.4g} %',
-            f'{s.nees:.2f} ({s.nees_interval[0]:.2f}–{s.nees_interval[1]:.2f})'
-            if isfinite(s.nees) else NOTHING,
         ] for name, s in statistics(outcomes).items()]
     return format_table([*changes[0], '', 'bias', 'RMSE', 'settled, median', 'settled, last',
-                         'within 1 %', 'NEES'], rows)
-
-
-def _print_shortfalls(jobs: Sequence[Job], outcomes: Sequence[Outcome]) -> None:
-    """Name the runs that broke off or did not end within 1 %."""
-    done = list(zip(jobs, outcomes, strict=True))
-    broken = [(job, outcome['problem']) for job, outcome in done if outcome['problem']]
-    missed = [(job, '') for job, outcome in done if not outcome['problem']
-              and any(outcome[f'settling_{name}'] is None for name in BACKLASH)]
-    for what, of in (('broke off', broken), ('not within 1 % at the end', missed)):
-        if of:
-            seeds = list(dict.fromkeys(str(job.values['seed']) for job, _ in of))
-            named = ', '.join(seeds[:10]) + (', ...' if len(seeds) > 10 else '')
-            why = f', the first one with: {of[0][1]}' if of[0][1] else ''
-            print(f'{what}: {len(of)} run{"s" if len(of) > 1 else ""}, seed {named}{why}')
+                         'within 1 %'], rows)
 
 
 def _seconds(time: float) -> str:
