@@ -76,14 +76,20 @@ def by_model(gap: float, others: Iterable[tuple[float, float]]) -> float:
 
 
 def effective(residual: Array) -> float:
-    """How many independent ones residuals (R,) count as: N (1 - r) / (1 + r)."""
+    """How many independent ones residuals (R,) count as: N (1 - r) / (1 + r); nan counts as none.
+    """
     r = lag_one(residual)
-    return len(residual) * (1.0 - r) / (1.0 + r)
+    return np.count_nonzero(np.isfinite(residual)) * (1.0 - r) / (1.0 + r)
 
 
-def lag_one(residual: Array) -> float:
-    """Correlation of the residuals (R,) of successive rows, at least 0."""
-    energy = float(np.mean(residual**2)) if len(residual) > 1 else 0.0
+def lag_one(residual: Array, certain: bool = False) -> float:
+    """Correlation of the residuals (R,) of successive rows but for nan, at least 0.
+
+    certain: only as far as it is beyond that of white noise.
+    """
+    residual = residual[np.isfinite(residual)]
+    energy = float(residual @ residual)
     if energy == 0.0 or not np.isfinite(energy):
         return 0.0
-    return min(max(float(np.mean(residual[1:] * residual[:-1])) / energy, 0.0), 0.99)
+    chance = 3.0 / sqrt(len(residual)) if certain else 0.0
+    return min(max(float(residual[1:] @ residual[:-1]) / energy - chance, 0.0), 0.99)

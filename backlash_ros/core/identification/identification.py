@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.fit import FIRST_STEPS
 from backlash_ros.core.identification.deviations import covariance_of, effective, lag_one
-from backlash_ros.core.identification.order_selection import PLATEAU, cancelled_poles, equal_delays
+from backlash_ros.core.identification.order_selection import PLATEAU, equal_delays
 from backlash_ros.core.identification.response import least_response, response_of
 from backlash_ros.core.identification.result import Details, HeldOut, Identification, Options
 from backlash_ros.core.identification.structure import (
@@ -163,20 +163,17 @@ def _described(
                        units.y + units.y_size * simulated, units.y_size * rms,
                        units.y_size * trained)
     delays = tuple(sorted({*equal_delays(s.compared, chosen), structure.delay}))
-    correlation = max(lag_one(residual) - 3.0 / sqrt(len(residual)), 0.0)
     observed = observed_of(s.samples, best, units)
     step, total = quantum(observed.y), float(g.numerator.sum())
+    static = total if structure.integrator else total / float(g.denominator.sum())
     verdict = judge(Findings(
-        observed, gap, sqrt(gap_var), apart, c_r, sqrt(max(c_r_var, 0.0)),
-        float(np.abs(g.at(middle))[0]),
-        total if structure.integrator else total / float(g.denominator.sum()),
-        gain_std, float(spread.max()),
+        observed, sqrt(gap_var), apart, sqrt(max(c_r_var, 0.0)),
+        float(np.copysign(np.abs(g.at(middle))[0], static)), gain_std, float(spread.max()),
         # Whatever the correlation: what explains nine tenths of y shows v.
         inf if squares < 0.1 * still
         else 0.5 * effective(residual) * log(still / max(squares, TINY)),
-        correlation, held_out.rms / max(held_out.trained, 1e-300),
-        [(units.v_size * rival, behind) for rival, behind in s.rivals], best.reversals, step,
-        cancelled_poles(best),
+        held_out.rms / max(held_out.trained, 1e-300),
+        [(units.v_size * rival, behind) for rival, behind in s.rivals],
         # Where many fit alike, the gap does not depend on the delay.
         structure.delay * (structure.delay == max(s.delays) and len(delays) < 3
                            and _delay_open(s.samples, best)),
@@ -194,7 +191,7 @@ def _described(
         denominator=(*best.denominator.tolist(), *[0.0] * at_zero),
         delay=structure.delay, delays=delays, integrator=structure.integrator,
         noise_std=units.y_size * sqrt(squares / max(free, 1)), quantum=step,
-        correlation=correlation, frequencies=frequencies, response_std=spread,
+        correlation=lag_one(residual, certain=True), frequencies=frequencies, response_std=spread,
         uncertainty=_as_parameter(2.0 * float(spread.max())),
         reasons=verdict.reasons, remarks=verdict.remarks, verdict=verdict,
         details=Details(

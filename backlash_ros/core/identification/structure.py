@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.fit import STEPS, Problem
 from backlash_ros.core.estimation.plant_family import padded, state_columns
-from backlash_ros.core.estimation.play import LEFT, RIGHT, play, reversals
+from backlash_ros.core.estimation.play import play
 from backlash_ros.core.estimation.posterior import Prior, WindowFit
 from backlash_ros.core.plant.numerics import lfilter
 
@@ -213,12 +213,6 @@ class Model:
     def denominator(self) -> Array:
         """A, with the integrator."""
         return np.array(self.structure.at(self.fit.xi)[1][:self.structure.order + 1])
-
-    @property
-    def reversals(self) -> int:
-        """How often the other side engaged: p went its way, where the gap is 0 as well."""
-        way = np.sign(np.diff(self.p, prepend=self.fit.p0))
-        return len(reversals(np.where(way > 0, RIGHT, np.where(way < 0, LEFT, 0)).astype(np.int8)))
 
 
 def fitted(

@@ -11,12 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from backlash_ros.core.identification.deviations import by_model, effective
-from backlash_ros.core.identification.linear_family import LinearFamily
-from backlash_ros.core.identification.not_play import Answer, Observed, what_it_is
+from backlash_ros.core.identification.deviations import by_model, effective, lag_one
+from backlash_ros.core.identification.not_play import Answer, LinearFamily, Observed, what_it_is
+from backlash_ros.core.records.readings import quantum
 
-ROUGHLY, PRECISE = 0.25, 0.1  # relative deviations: of a gap that is known; of gain and G
-SHOWS = 15.0  # log-likelihood by which the fit must beat a u that stands still
+PRECISE = 0.1  # relative deviation of gain and G that are known
 CERTAIN = 3.0  # standard deviations of what is there
 ANOTHER = 0.02  # relative distance of two gaps that are not the same
 WORTH_A_WORD = 0.05  # of the motion that the gap makes, that no model explains
@@ -50,35 +49,31 @@ class Verdict(NamedTuple):
 class Findings(NamedTuple):
     """What there is to judge by.
 
-    observed: signals of the fitted samples. gap, c_r and their standard deviations [v]. apart: that
-    of the gap by other structures. gain: mean response of y to v where y moves, static: at rest
-    (negative where y moves against v). gain_std, response_std: relative deviations of the gain at
-    rest, and of G where y moves. evidence: log-likelihood by which the fit beats a u that stands
-    still. correlation: of successive residuals beyond chance. later: rms of the errors on the
-    samples held out over that on the others. rivals: other gaps with the log-likelihood by which
-    they fall behind. reversals: of p. quantum: of y, 0 for none. cancelled: poles that zeros
-    cancel. open_delay [samples]: the longest that was compared, where a longer one fits as well,
-    else 0.
+    observed: signals of the fitted samples. gap_std, c_r_std: standard deviations [v]. apart: that
+    of the gap by other structures. gain: mean response of y to v where y moves, negative where y
+    moves against v. gain_std, response_std: relative deviations of the gain at rest, and of G where
+    y moves. evidence: log-likelihood by which the fit beats a u that stands still. later: rms of
+    the errors on the samples held out over that on the others. rivals: other gaps with the
+    log-likelihood by which they fall behind. open_delay [samples]: the longest that was compared,
+    where a longer one fits as well, else 0.
     """
 
     observed: Observed
-    gap: float
     gap_std: float
     apart: float
-    c_r: float
     c_r_std: float
     gain: float
-    static: float
     gain_std: float
     response_std: float
     evidence: float
-    correlation: float
     later: float
     rivals: Sequence[tuple[float, float]]
-    reversals: int
-    quantum: float
-    cancelled: Sequence[complex]
     open_delay: int
+
+    @property
+    def gap(self) -> float:
+        """That was found [v]."""
+        return self.observed.gap
 
     @property
     def swing(self) -> float:
@@ -86,16 +81,17 @@ class Findings(NamedTuple):
         return float(np.ptp(self.observed.v))
 
     @property
-    def rms(self) -> float:
-        """Of the residual."""
-        return float(np.sqrt(np.nanmean(self.observed.residual**2)))
+    def quantum(self) -> float:
+        """Step of a quantised y, 0 for none."""
+        return quantum(self.observed.y)
 
     @property
     def unexplained(self) -> float:
         """Correlated part of the residual, as a motion of v."""
         # What an encoder rounds away, a twelfth with a margin, repeats itself, but is explained.
-        excess = self.rms**2 - 1.5 / 12.0 * self.quantum**2
-        return float(np.sqrt(max(excess * self.correlation, 0.0)) / max(self.gain, 1e-300))
+        excess = self.observed.rms**2 - 1.5 / 12.0 * self.quantum**2
+        correlation = lag_one(self.observed.residual, certain=True)
+        return float(np.sqrt(max(excess * correlation, 0.0)) / max(abs(self.gain), 1e-300))
 
 
 class Doubt(NamedTuple):
@@ -111,8 +107,9 @@ def judge(f: Findings) -> Verdict:
     other, changes = what_it_is(f.observed), [*_changes(f)]
     doubts = [*_doubts(f), *changes]
     spread = float(np.linalg.norm([doubt.deviation for doubt in doubts]))
-    backlash = _backlash(f, other, max(doubts), spread)
-    remarks = _remarks(f)
+    backlash = other if other is not None and not other.known else \
+        _backlash(f, max(doubts), spread)
+    remarks = [text for true, text in _remarks(f) if true]
     if backlash.known:
         remarks += [doubt.why for doubt in changes]
         remarks += [] if other is None else [other.sentence]
@@ -121,61 +118,59 @@ def judge(f: Findings) -> Verdict:
 
 def _doubts(f: Findings) -> list[Doubt]:
     """What the deviation of the gap consists of."""
-    moved, o, several = f.gain * f.gap, f.observed, 'move v at several speeds and amplitudes'
+    moved, o, several = abs(f.gain) * f.gap, f.observed, 'move v at several speeds and amplitudes'
     quantised = f.quantum > moved
     noise = f'y is quantised in steps of {f.quantum:.3g}' if quantised else \
-        f'y has a noise of {f.rms:.2g}'
+        f'y has a noise of {o.rms:.2g}'
     doubts = [
         Doubt(f.gap_std, f'{noise}, and the gap moves it by {moved:.2g}',
               'use a finer sensor, or record for longer' if quantised else
               'record for longer, or turn v more often'),
         Doubt(0.3 * f.unexplained, 'something else than a backlash and a linear G moves y by '
-              f'{f.unexplained * f.gain:.2g}', 'see the residual on the page: friction, a load '
-              'that moves by itself, or a higher order with --order'),
+              f'{f.unexplained * abs(f.gain):.2g}', 'see the residual on the page: friction, a '
+              'load that moves by itself, or a higher order with --order'),
         Doubt(f.apart, 'other orders or delays fit nearly as well, with another gap', several),
         # A delay that is too short by a sample looks like a gap that is wider by its motion of v.
         Doubt(bool(f.open_delay) * float(np.abs(np.diff(o.v)).mean()),
               'the delay may be a longer one', 'compare longer ones with --delay'),
     ]
     if o.unexplained and o.family is not None:
-        gap, squares = abs(o.one_play.at[0]), o.one_play.squares / len(o.family.rows)
-        rows = effective(o.residual[np.isfinite(o.residual)])
+        gap = abs(o.one_play.at[0]) * o.family.swing
+        squares, rows = o.one_play.squares / len(o.family.rows), effective(o.residual)
         # Each of its columns costs as much as an unknown of any other structure.
-        behind = rows * log(squares / f.rms**2) + o.family.unknowns * log(max(rows, 1.0))
+        unknowns = o.one_play.columns.shape[1] + o.family.common.shape[1]
+        behind = rows * log(squares / o.rms**2) + unknowns * log(max(rows, 1.0))
         doubts.append(Doubt(by_model(f.gap, [(gap, behind)]),
                             f'with another linear G it would be {gap:.3g}', several))
     return doubts
 
 
-def _backlash(f: Findings, other: Answer | None, most: Doubt, spread: float) -> Answer:
+def _backlash(f: Findings, most: Doubt, spread: float) -> Answer:
     """Whether the gap is known, or that there is none."""
-    fewest_reversals = 3  # fewer leave gap, crossings and start entangled
-    if other is not None and not other.known:
-        return other
-    if f.evidence < SHOWS:
-        return Answer(
-            False, f'y shows nothing of v, which swung by {f.swing:.4g}',
-            'let v swing wider than the gap, and see that v is what the actuator gets',
-        )
-    if f.gap >= 0.95 * f.swing:
-        return Answer(
-            False, f'the gap is at its bound, the swing of v ({f.swing:.4g})',
-            'let v swing wider, past the gap in both directions',
-        )
-    if f.reversals < fewest_reversals:
-        return Answer(
-            False, f'v went past the gap and back {f.reversals} times, {fewest_reversals} are '
-            'needed', 'move it to and fro more often, or record for longer',
-        )
-    for rival, behind in f.rivals:
-        if behind < 6.0 and abs(rival - f.gap) > max(5.0 * f.gap_std, ANOTHER * f.gap):
-            return Answer(False, f'two gaps fit alike, {f.gap:.4g} and {rival:.4g}',
-                          'move v at several speeds and amplitudes')
+    roughly = 0.25  # relative deviation of a gap that is known
+    p = f.observed.p
+    way = np.sign(np.diff(p))
+    turns = int(np.count_nonzero(np.diff(way[way != 0.0])))
+    alike = [rival for rival, behind in f.rivals if behind < 6.0
+             and abs(rival - f.gap) > max(5.0 * f.gap_std, ANOTHER * f.gap)]
+    for true, reason, cure in (
+        (f.evidence < 15.0, f'y shows nothing of v, which swung by {f.swing:.4g}',
+         'let v swing wider than the gap, and see that v is what the actuator gets'),
+        (f.gap >= 0.95 * f.swing, f'the gap is at its bound, the swing of v ({f.swing:.4g})',
+         'let v swing wider, past the gap in both directions'),
+        # Fewer leave gap, crossings and start entangled.
+        (turns < 3, f'v went past the gap and back {turns} times, 3 are needed',
+         'move it to and fro more often, or record for longer'),
+        (bool(alike), f'two gaps fit alike, {f.gap:.4g} and {alike[0] if alike else 0.0:.4g}',
+         'move v at several speeds and amplitudes'),
+    ):
+        if true:
+            return Answer(False, reason, cure)
     unexplained = f.unexplained > 0.5 * max(f.gap, CERTAIN * f.gap_std)
     of_noise = most.deviation <= max(f.gap_std, 0.3 * f.unexplained)
     if f.gap <= CERTAIN * spread and of_noise and not unexplained:
         return _no_gap(f, spread)
-    if spread <= ROUGHLY * f.gap and not unexplained:
+    if spread <= roughly * f.gap and not unexplained:
         return Answer(True, f'the gap is {f.gap:.4g} ± {spread:.2g}')
     return Answer(False, f'the gap, about {f.gap:.3g}, is known to ± {spread:.2g} only: {most.why}',
                   most.cure)
@@ -183,10 +178,11 @@ def _backlash(f: Findings, other: Answer | None, most: Doubt, spread: float) -> 
 
 def _no_gap(f: Findings, spread: float) -> Answer:
     """Where 0 lies within the deviations of the gap: whether that is a gap of 0."""
+    o = f.observed
     # Of what moves y otherwise, a gap may be four deviations that was not found.
     bound = f.gap + CERTAIN * spread + 4.0 * f.unexplained
     text = f'a gap of up to {bound:.2g} cannot be ruled out'
-    if bound > max(0.02 * f.swing, f.quantum / max(f.gain, 1e-300)):
+    if bound > max(0.02 * f.swing, f.quantum / max(abs(f.gain), 1e-300)):
         return Answer(False, text, 'record for longer, or turn v more often and faster')
     if f.gain_std > PRECISE:
         return Answer(
@@ -194,9 +190,9 @@ def _no_gap(f: Findings, spread: float) -> Answer:
             'move v at several speeds, with rests',
         )
     # Rounding of v as well as of y leaves a step, and some more while both move.
-    if f.rms > max(2.0 * f.observed.noise, 1.5 * f.quantum):
-        return Answer(False, f'{text}: the fit leaves {f.rms:.2g}, and the noise of y is '
-                      f'{f.observed.noise:.2g}', 'see the residual on the page')
+    if o.rms > max(2.0 * o.noise, 1.5 * f.quantum):
+        return Answer(False, f'{text}: the fit leaves {o.rms:.2g}, and the noise of y is '
+                      f'{o.noise:.2g}', 'see the residual on the page')
     return Answer(True, f'there is no backlash: the gap is below {bound:.2g}')
 
 
@@ -219,44 +215,36 @@ def _model(f: Findings) -> Answer:
             False, f'the middle of the gap is known to ± {f.c_r_std:.2g} only, further than v '
             'moved', 'move v further and with rests; a y that drifts hides it',
         )
-    if spread <= PRECISE:
-        return Answer(True, f'G is known to {100.0 * spread:.2g} %, good enough to start with')
     if spread <= 0.5:
-        return Answer(
-            True, f'G is known to {100.0 * spread:.2g} %: good enough to start the controller with '
-            'plant.uncertainty as in identified.yaml, which learns the rest',
-        )
+        enough = 'good enough to start with' if spread <= PRECISE else 'good enough to start the ' \
+            'controller with plant.uncertainty as in identified.yaml, which learns the rest'
+        colon = ',' if spread <= PRECISE else ':'
+        return Answer(True, f'G is known to {100.0 * spread:.2g} %{colon} {enough}')
     much = f'{100.0 * spread:.2g} %' if spread < 1.0 else 'nothing'
     return Answer(False, f'G, where y moves, is known to {much}',
                   'move v at more speeds, record for longer, or limit --order')
 
 
-def _remarks(f: Findings) -> list[str]:
+def _remarks(f: Findings) -> list[tuple[bool, str]]:
+    """Sentences, each with whether it is true."""
     share = f.unexplained / f.gap if f.gap > 0.0 else 0.0
     speeds = np.abs(np.diff(f.observed.v))
     speeds = speeds[speeds > 0.01 * speeds.max(initial=0.0)]
-    one_speed = len(speeds) > 0 and np.std(speeds) < 0.05 * np.mean(speeds)
-    pole = '' if not f.cancelled else (
-        f'{f.cancelled[0].real:.4g}' if abs(f.cancelled[0].imag) < 1e-9 else
-        f'{f.cancelled[0]:.4g}')
-    return [text for true, text in (
-        (f.static < 0.0 and f.gain_std <= PRECISE,
-         'y moves against v: the gain of G is negative'),
+    return [
+        (f.gain < 0.0 and f.gain_std <= PRECISE, 'y moves against v: the gain of G is negative'),
         (f.open_delay > 0,
          f'the delay of {f.open_delay} samples is the longest that was compared, and the gap may '
          f'have some of a longer one: try --delay {f.open_delay}-{min(2 * f.open_delay + 4, 40)}'),
         (WORTH_A_WORD < share <= 1.0,
          f'{share:.0%} of the motion that the gap makes follows from no backlash and no linear G: '
          'the deviations tell of it'),
-        (one_speed,
+        (len(speeds) > 0 and np.std(speeds) < 0.05 * np.mean(speeds),
          'v moved at one speed only: a lag before the gap would look like a wider gap; move v at '
          'several speeds'),
-        (pole, f'the pole {pole} is cancelled by a zero: a lower order does as well; limit '
-         '--order'),
-        (f.later > 2.0 and f.rms > f.observed.noise,
+        (f.later > 2.0 and f.observed.rms > f.observed.noise,
          f'the last part of the record is predicted {f.later:.2g} times worse than the rest is '
          'fitted: the plant changed on the way, or the record is short'),
-    ) if true]
+    ]
 
 
 def _changes(f: Findings) -> Iterator[Doubt]:
@@ -271,7 +259,6 @@ def _changes(f: Findings) -> Iterator[Doubt]:
         at = np.linspace(over.min(), over.max(), knots)
         hats = np.array([np.interp(over, at, row) for row in np.eye(knots)])
         gaps, other = family.changing(f.gap, hats)
-        gaps = np.maximum(gaps, 0.0)
         if np.ptp(gaps) > 0.1 * f.gap and family.explains(other, one, o.noise, 0.5):
             yield Doubt(float(np.sqrt(np.mean((gaps @ hats - f.gap) ** 2))),
                         f'the gap changes {what}: ' + ', '.join(f'{gap:.3g}' for gap in gaps),

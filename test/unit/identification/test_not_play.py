@@ -1,5 +1,6 @@
 """What is not a play is named by what it is; a play, whatever G is behind it, is not."""
 
+import re
 from collections.abc import Callable
 
 import numpy as np
@@ -7,8 +8,14 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from backlash_ros.core.identification.linear_family import LinearFamily
-from backlash_ros.core.identification.not_play import SYMPTOMS, Observed, what_it_is
+from backlash_ros.core.identification.not_play import (
+    BESIDE_V,
+    LEFT_OVER,
+    LinearFamily,
+    Observed,
+    best_other,
+    what_it_is,
+)
 
 Array = NDArray[np.float64]
 
@@ -98,6 +105,22 @@ def test_another_nonlinearity_is_named(name: str, plant: str) -> None:
     assert said in named(observed(V, behind(nonlinearity(V), plant)))
 
 
+def test_a_stick_band_behind_each_turn_is_named_with_its_jump() -> None:
+    stop = last = place = float(V[0])
+    way, u = 0.0, []
+    for value in V.tolist():
+        if (value - last) * way < 0.0:
+            stop, way = last, 0.0
+        if not way and abs(value - stop) > 0.8:
+            way = float(np.sign(value - stop))
+        place = value - 0.25 * way if way else place
+        last = value
+        u.append(place)
+    reason = named(observed(V, behind(np.array(u), 'lag'), 0.6))
+    band, jump = (float(word) for word in re.findall(r'by (?:what )?([\d.]+)', reason))
+    assert (band, jump) == pytest.approx((0.8, 0.3), abs=0.01)
+
+
 def test_stick_and_slip_is_named() -> None:
     assert 'y sticks and slips' in named(observed(V, behind(sticking(V), 'gain'), 0.9))
 
@@ -110,7 +133,8 @@ def test_a_play_is_nothing_else(plant: str, gap: float, noise: float) -> None:
     o = observed(V, behind(play(V, gap), plant, noise), gap, noise)
     assert what_it_is(o) is None
     # Not even where the residual asks for it.
-    assert all(symptom.test(o) is None for symptom in SYMPTOMS)
+    assert all(test(o) is None for test, _, _ in (*BESIDE_V, *LEFT_OVER))
+    assert best_other(o) is None
 
 
 @pytest.mark.parametrize('noise', [0.05, 0.3])

@@ -5,16 +5,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from test_not_play import GAP, NOISE, V, behind, dead_zone, observed, play
 
 from backlash_ros.core.identification.verdict import Findings, Verdict, judge
 
 GOOD = observed(V, behind(play(V, GAP), 'lag'))
+WANDER = 0.0155 * lfilter([1.0], [1.0, -0.95], np.random.default_rng(8).standard_normal(len(V)))
 SAW = 0.02 * np.abs(np.arange(3000) % 400 - 200.0)
 FOUND = Findings(
-    GOOD, gap=GAP, gap_std=0.01, apart=0.0, c_r=0.3, c_r_std=0.01, gain=0.8, static=1.0,
-    gain_std=0.01, response_std=0.02, evidence=1e3, correlation=0.0, later=1.0,
-    rivals=(), reversals=20, quantum=0.0, cancelled=(), open_delay=0,
+    GOOD, gap_std=0.01, apart=0.0, c_r_std=0.01, gain=0.8, gain_std=0.01, response_std=0.02,
+    evidence=1e3, later=1.0, rivals=(), open_delay=0,
 )
 
 
@@ -49,14 +50,18 @@ def test_what_would_mislead_a_controller_is_refused(changed: dict[str, Any], sai
 
 @pytest.mark.parametrize(('changed', 'said'), [
     ({'evidence': 3.0}, 'y shows nothing of v'),
-    ({'gap': 5.7}, 'the gap is at its bound'),
-    ({'reversals': 2}, 'went past the gap and back 2 times'),
+    ({'observed': replace(GOOD, gap=5.7)}, 'the gap is at its bound'),
+    ({'observed': replace(GOOD, p=GOOD.p * (np.arange(len(V)) > 2700))},
+     'went past the gap and back 2 times'),
     ({'rivals': [(0.9, 2.0)]}, 'two gaps fit alike, 0.6 and 0.9'),
     ({'apart': 0.18}, 'other orders or delays fit nearly as well'),
     ({'gap_std': 0.18}, 'y has a noise of 0.002, and the gap moves it by 0.48'),
-    ({'gap_std': 0.18, 'quantum': 0.5}, 'quantised in steps of 0.5'),
-    ({'gap': 0.01, 'gap_std': 0.1}, 'a gap of up to 0.31 cannot be ruled out'),
-    ({'gap': 0.01, 'gap_std': 0.01, 'gain_std': 0.5}, 'a slow lag looks like a gap'),
+    ({'gap_std': 0.18, 'observed': replace(GOOD, y=0.5 * np.round(GOOD.y / 0.5), noise=0.15)},
+     'quantised in steps of 0.5'),
+    ({'observed': replace(GOOD, gap=0.01), 'gap_std': 0.1},
+     'a gap of up to 0.31 cannot be ruled out'),
+    ({'observed': replace(GOOD, gap=0.01), 'gap_std': 0.01, 'gain_std': 0.5},
+     'a slow lag looks like a gap'),
 ])
 def test_why_the_gap_is_not_known_is_told_with_the_cure(changed: dict[str, Any], said: str) -> None:
     found = verdict(**changed)
@@ -69,29 +74,29 @@ def test_why_the_gap_is_not_known_is_told_with_the_cure(changed: dict[str, Any],
 
 
 def test_no_backlash_is_said_with_a_bound() -> None:
-    o = observed(V, behind(V, 'lag'), 0.0)
-    found = judge(FOUND._replace(observed=o, gap=0.004, gap_std=0.004, c_r=0.002))
+    o = replace(observed(V, behind(V, 'lag'), 0.0), gap=0.004)
+    found = judge(FOUND._replace(observed=o, gap_std=0.004))
     assert found.backlash.known
     assert found.backlash.reason == 'there is no backlash: the gap is below 0.016'
 
 
-def test_a_gap_that_another_linear_g_would_have_otherwise_is_not_known() -> None:
-    # Of a single sine, a lag and many small plays look like one that is wider.
+def test_many_small_plays_that_look_like_a_wider_one_are_named() -> None:
+    # Of a single sine, with a lag.
     sine = 2.0 * np.sin(0.03 * np.arange(len(V)))
     plays = sum(0.2 * play(sine, width) for width in np.linspace(0.0, 1.2, 5))
     o = observed(sine, behind(plays, 'lag'), 2.0)
-    found = judge(FOUND._replace(observed=o, gap=2.0))
+    found = judge(FOUND._replace(observed=o))
     assert not found.backlash.known
-    assert 'with another linear G it would be' in found.backlash.reason
+    assert 'many plays in parallel' in found.backlash.reason
 
 
 def test_what_no_model_explains_widens_the_deviations_and_then_refuses() -> None:
-    rough = observed(V, behind(play(V, GAP), 'lag', 0.05), GAP, NOISE)
-    some = judge(FOUND._replace(observed=rough, correlation=0.9))
+    rough = observed(V, behind(play(V, GAP), 'lag') + WANDER, GAP, NOISE)
+    some = judge(FOUND._replace(observed=rough))
     assert some.backlash.known
     assert some.gap_std > 1.5 * FOUND.gap_std
     assert any('the deviations tell of it' in text for text in some.remarks)
-    much = judge(FOUND._replace(observed=rough, correlation=0.9, gain=0.1))
+    much = judge(FOUND._replace(observed=rough, gain=0.1))
     assert not much.backlash.known
     assert 'something else than a backlash and a linear G moves y' in much.backlash.reason
 
@@ -105,7 +110,7 @@ def test_what_is_no_play_is_named_first() -> None:
 
 def test_a_gap_that_changes_is_told_with_its_values_and_widens_the_deviation() -> None:
     u = np.where(np.arange(len(V)) < 1500, play(V, GAP), play(V, 0.8))
-    found = judge(FOUND._replace(observed=observed(V, behind(u, 'lag'), 0.7), gap=0.7))
+    found = judge(FOUND._replace(observed=observed(V, behind(u, 'lag'), 0.7)))
     (said,) = [text for text in found.remarks if 'changes within the record' in text]
     first, _, last = (float(word) for word in said.partition(': ')[2].split(', '))
     assert (first, last) == pytest.approx((0.55, 0.85), abs=0.03)  # the ends of a ramp
@@ -113,9 +118,8 @@ def test_a_gap_that_changes_is_told_with_its_values_and_widens_the_deviation() -
 
 
 @pytest.mark.parametrize(('changed', 'said'), [
-    ({'static': -1.0}, 'the gain of G is negative'),
+    ({'gain': -0.8}, 'the gain of G is negative'),
     ({'open_delay': 3}, 'try --delay 3-10'),
-    ({'cancelled': [0.97 + 0j]}, 'the pole 0.97 is cancelled'),
     ({'later': 20.0, 'observed': replace(GOOD, noise=1e-4)}, '20 times worse'),
     ({'observed': observed(SAW, behind(play(SAW, GAP), 'lag'))}, 'one speed only'),
 ])
