@@ -40,12 +40,11 @@ class CheckDriverNode(MotionNode):
         self.exit_code = DONE if all_fit(findings) else FAILED
 
     def _save(self, path: Path) -> None:
-        timing = timing_of(self.heard, self.settings.sample_period)
-        acted = timing.v_acted(self.heard)
-        if acted is None:
+        record = timing_of(self.heard, self.settings.sample_period).record(self.heard)
+        if record is None:
             self.say(f'nothing to save in {path}: v and y were not both heard')
             return
-        v, y = timing.record(acted)
+        v, y = record
         rows = np.column_stack([self.settings.sample_period * np.arange(len(v)), v, y])
         try:
             np.savetxt(path, rows, '%.12g', ',', header='t,v,y', comments='')

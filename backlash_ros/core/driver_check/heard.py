@@ -35,10 +35,9 @@ class Message(NamedTuple):
 class Graph:
     """What the ROS graph says about the topics of the driver.
 
-    publishers: of plant_output. types: of plant_output. listeners: of control, without the
-    tools of this package. misfits: reasons why messages cannot pass, from QoS.
-    best_effort: whether plant_output is published without guarantee. near_control: subscribed
-    topics of a name like control.
+    publishers, types, best_effort (without guarantee): of plant_output. listeners: of control,
+    without the tools of this package. misfits: reasons why messages cannot pass, from QoS.
+    near_control: subscribed topics of a name like control.
     """
 
     publishers: int = 0
@@ -82,11 +81,6 @@ class Timing(NamedTuple):
     lateness: float = 0.0
     fits: bool = True
 
-    def v_acted(self, heard: Heard) -> Array | None:
-        """v over each sample interval (N,) as it is reported, or else as it was commanded."""
-        applied = self.v_of(heard.applied, True)
-        return self.v_of(heard.controls, False) if applied is None else applied
-
     def v_of(self, messages: Sequence[Message], reported: bool) -> Array | None:
         """v over each sample interval (N,), nan before any; None where nothing tells it.
 
@@ -99,8 +93,15 @@ class Timing(NamedTuple):
                            np.array([message.value for message in usable]), reported)
         return v if np.isfinite(v).any() else None
 
-    def record(self, v: Array) -> tuple[Array, Array]:
-        """v from sample k to k+1 and y at k, nan where lost, from the first known v on."""
+    def record(self, heard: Heard) -> tuple[Array, Array] | None:
+        """v from sample k to k+1, as reported or else commanded, and y at k, nan where lost.
+
+        From the first known v on; None where v or y was not heard.
+        """
+        v = self.v_of(heard.applied, True)
+        v = self.v_of(heard.controls, False) if v is None else v
+        if v is None:
+            return None
         y = np.full(len(v), np.nan)
         y[self.numbers] = [m.value if plausible(m.value) else np.nan for m in self.outputs]
         known = int(np.argmax(np.isfinite(v)))
@@ -109,7 +110,10 @@ class Timing(NamedTuple):
 
 def timing_of(heard: Heard, sample_period_s: float) -> Timing:
     """Sort out what came twice or early, and count the samples; none where they are too few."""
-    outputs, repeated = _without_doubles(heard.outputs, sample_period_s)
+    outputs = _without_doubles(heard.outputs, 0.25e9 * sample_period_s)
+    repeated = len(heard.outputs) - len(outputs)
+    if repeated > 0.6 * len(heard.outputs):  # a plant at rest
+        outputs, repeated = heard.outputs, 0
     if len(outputs) < FEWEST_SAMPLES:
         return Timing([], np.zeros(0, dtype=np.int64), sample_period_s, repeated=repeated)
     rough = max(float(np.median(np.diff(stamps_of(outputs)))), 1.0)
@@ -130,8 +134,8 @@ def timing_of(heard: Heard, sample_period_s: float) -> Timing:
     # Amid bursts the samples cannot be counted for certain; most intervals tell the period still.
     period, most_off = (slope, 0.01) if lateness <= MOST_LATE else (rough * 1e-9, 0.1)
     fits = abs(period / sample_period_s - 1.0) <= most_off
-    early = len(outputs) - len(samples)
-    return Timing(samples, numbers, period, missing, repeated, early, lateness, fits)
+    return Timing(
+        samples, numbers, period, missing, repeated, len(outputs) - len(samples), lateness, fits)
 
 
 def stamps_of(messages: Sequence[Message]) -> NDArray[np.int64]:
@@ -139,21 +143,16 @@ def stamps_of(messages: Sequence[Message]) -> NDArray[np.int64]:
     return np.array([message.stamp_ns for message in messages], dtype=np.int64)
 
 
-def _without_doubles(
-    outputs: Sequence[Message], sample_period_s: float,
-) -> tuple[list[Message], int]:
-    """Without those that came again within a quarter of a period, and how many these were."""
-    kept = list(outputs[:1])
-    numbered_doubles = 0  # they must not look like gaps in the numbers
-    for message in outputs[1:]:
+def _without_doubles(outputs: Sequence[Message], soon_ns: float) -> list[Message]:
+    """Without those that came again so soon; no gaps in the numbers where they were."""
+    kept: list[Message] = []
+    doubles = 0
+    for message in outputs:
         if message.number != UNNUMBERED:
-            message = message._replace(number=message.number - numbered_doubles)
-        before = kept[-1]
-        again = message.value == before.value or message.number == before.number != UNNUMBERED
-        if not again or message.stamp_ns - before.stamp_ns > 0.25 * sample_period_s * 1e9:
+            message = message._replace(number=message.number - doubles)
+        if kept and message.stamp_ns - kept[-1].stamp_ns <= soon_ns and (
+                message.value == kept[-1].value or message.number == kept[-1].number != UNNUMBERED):
+            doubles += message.number != kept[-1].number
+        else:
             kept.append(message)
-        elif message.number != before.number:
-            numbered_doubles += 1
-    repeated = len(outputs) - len(kept)
-    # A larger share of equal values is a plant at rest.
-    return (list(outputs), 0) if repeated > 0.6 * len(outputs) else (kept, repeated)
+    return kept

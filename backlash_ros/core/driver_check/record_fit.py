@@ -56,11 +56,11 @@ class RecordFit:
     @property
     def estimates(self) -> dict[str, tuple[float, float]]:
         """Values and standard deviations of m (negative where G has the wrong sign), c_r, c_l."""
-        if self.fit is None:
-            return dict.fromkeys(('m', 'c_r', 'c_l'), (nan, nan))
-        values = self.fit.crossings * [self.sign, 1.0, 1.0]
-        return dict(zip(('m', 'c_r', 'c_l'), zip(
-            values.tolist(), self.fit.crossings_std.tolist(), strict=True), strict=True))
+        values, std = (nan, nan, nan), (nan, nan, nan)
+        if self.fit is not None:
+            values = (self.fit.crossings * [self.sign, 1.0, 1.0]).tolist()
+            std = self.fit.crossings_std.tolist()
+        return dict(zip(('m', 'c_r', 'c_l'), zip(values, std, strict=True), strict=True))
 
     @property
     def gap(self) -> float:
@@ -111,31 +111,26 @@ def fit_record(
     longest = max(delays)
     # y(k+1) follows v(k - delay); all delays are compared over the same samples of y.
     after = y[longest + 1:]
-    if np.count_nonzero(np.isfinite(after)) < 10 * (nominal.order + 2):
-        text = f'too few samples: {len(after)} after the longest delay'
-        return RecordFit(nominal, nominal, (text,))
-    if np.ptp(v) == 0.0:
-        return RecordFit(nominal, nominal, ('v stood still',))
-    found: dict[int, RecordFit] = {}
-    evidence = dict.fromkeys(delays, -inf)
-    for delay in delays:
-        acted = v[longest - delay:len(v) - 1 - delay]
-        each = _with_delay(acted, after, nominal, uncertainty, noise_std, bounds)
-        if each.fit is not None:
-            found[delay], evidence[delay] = each, each.fit.evidence
+    few = np.count_nonzero(np.isfinite(after)) < 10 * (nominal.order + 2)
+    found = [] if few or np.ptp(v) == 0.0 else [fit for delay in delays if (fit := _fitted(
+        v[longest - delay:len(v) - 1 - delay], after, nominal, uncertainty, noise_std, bounds,
+        delay))]
     if not found:
-        return RecordFit(
-            nominal, nominal, (f'y shows nothing of v, which swung by {np.ptp(v):.4g}',))
-    delay = max(found, key=lambda each: evidence[each])
-    return replace(found[delay], delay=delay, margins={
-        each: evidence[delay] - value for each, value in evidence.items()})
+        why = f'too few samples: {len(after)} after the longest delay' if few \
+            else 'v stood still' if np.ptp(v) == 0.0 \
+            else f'y shows nothing of v, which swung by {np.ptp(v):.4g}'
+        return RecordFit(nominal, nominal, (why,))
+    evidence = {each.delay: each.fit.evidence for each in found if each.fit is not None}
+    best = max(found, key=lambda each: evidence[each.delay])
+    return replace(best, margins={
+        delay: evidence[best.delay] - evidence.get(delay, -inf) for delay in delays})
 
 
-def _with_delay(
+def _fitted(
     v: Array, y: Array, nominal: TransferFunction, uncertainty: float, noise_std: float,
-    bounds: Bounds | None,
-) -> RecordFit:
-    """Fit v (N,) and y (N,) after it; without a fit where a constant u explains y as well."""
+    bounds: Bounds | None, delay: int,
+) -> RecordFit | None:
+    """Fit v (N,) and y (N,) after it; None where a constant u explains y as well."""
     noise_std, wide, swing = max(noise_std, SMALLEST_NOISE), (-1e300, 1e300), float(np.ptp(v))
     record = Window(0, v, y, np.full(len(v), nan))
     for sign in (1.0, -1.0):
@@ -146,7 +141,7 @@ def _with_delay(
         if fit is None or fit.m > 0.0:
             break
     if fit is None or not fit.valid:
-        return RecordFit(nominal, nominal)
+        return None
     problem = problem_of(setup, record)
     wild = outliers(problem.residual(fit), noise_std)
     if wild.any():
@@ -157,31 +152,24 @@ def _with_delay(
         learned = _times(family.model_at(fit.xi), sign)
     p = np.append(fit.p0, problem.input(fit)[0])
     result = RecordFit(
-        nominal, learned, fit=fit, sign=sign,
+        nominal, learned, fit=fit, sign=sign, delay=delay,
         predicted=1.0 - fit.rms / max(float(np.nanstd(record.y)), 1e-300),
         reversals=turns(p, 5.0 * fit.gap_std))
-    return replace(result, doubts=_doubts(result, fit, bounds, swing))
-
-
-def _doubts(
-    found: RecordFit, fit: WindowFit, bounds: Bounds | None, swing: float,
-) -> tuple[str, ...]:
-    """What keeps it from being precise enough for the loop."""
     wanted = REVERSALS if len(fit.xi) else 1
     rest = f': {fit.unexplained:.0%} of its motion follows from no backlash and no G' \
         if fit.correlation > 0.0 and isfinite(fit.unexplained) else ''
     std_m, beyond = float(fit.crossings_std[0]), outside_bounds(bounds, fit) if bounds else []
-    return tuple(text for true, text in (
-        (found.reversals < wanted,
-         f'v crossed the gap {found.reversals} times; {wanted} at least are needed to tell both '
+    return replace(result, doubts=tuple(text for true, text in (
+        (result.reversals < wanted,
+         f'v crossed the gap {result.reversals} times; {wanted} at least are needed to tell both '
          'crossings'),
         (not std_m <= STD_SLOPE * fit.m, f'm is known to {std_m:.2g} only'),
         # A gap of 0 is known to 1 % of the swing.
         (not fit.gap_std <= max(STD_GAP * fit.gap, 0.01 * swing),
          f'the gap, about {fit.gap:.4g}, is known to {fit.gap_std:.2g} only{rest}'),
         *((far, f'{name} would be {value:.4g}, outside of its bounds')
-          for (name, (value, _)), far in zip(found.estimates.items(), beyond, strict=False)),
-    ) if true)
+          for (name, (value, _)), far in zip(result.estimates.items(), beyond, strict=False)),
+    ) if true))
 
 
 def _times(model: TransferFunction, sign: float) -> TransferFunction:

@@ -128,7 +128,7 @@ NUMERATOR, DENOMINATOR = model(0.004)
 @pytest.mark.parametrize(('heard', 'changes', 'subject', 'told'), [
     (heard_from_driver, {'sample_period': 0.05}, 'rate', ['25 Hz', 'set sample_period']),
     (heard_from_driver, {'plant__numerator': NUMERATOR, 'plant__denominator': DENOMINATOR},
-     'G(z)', ['about 0.004 s']),
+     'G(z)', ['discretised']),
     (lambda: with_outputs(some_lost), {}, 'lost samples', ['20 of 200 samples']),
     (lambda: with_outputs(
         lambda sent: [m._replace(number=k + 1) for k, m in enumerate(some_lost(sent))]
