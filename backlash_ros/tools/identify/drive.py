@@ -11,9 +11,10 @@ import tempfile
 import threading
 import time
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
-from math import inf
+from functools import partial
 from pathlib import Path
 from typing import TextIO
 
@@ -30,7 +31,7 @@ from backlash_ros.options import BAD_INPUT
 from backlash_ros.tools.cli import BrokenOffError, InputError, StopRequests
 from backlash_ros.tools.config import write_config
 from backlash_ros.tools.identify.outcome import identify_record
-from backlash_ros.tools.records.messages import FEWEST_MESSAGES, from_messages
+from backlash_ros.tools.records.messages import FEWEST_MESSAGES, as_messages, from_messages
 
 
 def drive(
@@ -91,39 +92,10 @@ class _Messages:
             self._heard.setdefault(topic, []).append((int(stamp), float(value)))
         if len(self._heard.get(topics.PLANT_OUTPUT, ())) < FEWEST_MESSAGES:
             return None
-        heard = {}
-        for topic, pairs in self._heard.items():
-            stamps, values = zip(*pairs, strict=True)
-            heard[topic] = np.array(stamps, dtype=np.int64), np.array(values)
-        try:
-            return replace(from_messages(heard, self._period), source='the motion')
-        except RecordError:
-            return None
-
-
-class _Estimate(threading.Thread):
-    """What a record says, looked for beside the motion by a thread that gives way to it.
-
-    found: None until it is known.
-    """
-
-    def __init__(self, record: Record, options: argparse.Namespace) -> None:
-        super().__init__(daemon=True)
-        self.found: Identification | None = None
-        self.given_up = False
-        self._record, self._options = replace(record, commands=None), options
-        self.start()
-
-    def run(self) -> None:
-        """Look, until it is known or given up."""
-        if sys.platform == 'linux':
-            os.nice(5)  # this thread alone gives way to the driver and to what moves it
-        with suppress(_GivenUpError):
-            self.found = identify_record(self._record, self._options, self._go_on)
-
-    def _go_on(self, _: str) -> None:
-        if self.given_up:
-            raise _GivenUpError
+        with suppress(RecordError):
+            return replace(from_messages({topic: as_messages(pairs) for topic, pairs in
+                                          self._heard.items()}, self._period), source='the motion')
+        return None
 
 
 class _GivenUpError(Exception):
@@ -134,9 +106,24 @@ def _follow(
     child: subprocess.Popen[bytes], messages: _Messages, options: argparse.Namespace,
     stop: StopRequests,
 ) -> None:
-    """Show progress until the motion ends, is precise enough, or is to be stopped."""
-    next_look, growth, said = 3.0, 1.5, ''  # [s] of motion before an estimate, and to the next one
-    estimate: _Estimate | None = None
+    """Show progress until the motion ends, is precise enough, or is to be stopped.
+
+    What the record says is looked for beside the motion, by a thread that gives way to the driver.
+    """
+    next_look, said = 3.0, ''  # [s] of motion before an estimate
+    given_up = threading.Event()
+
+    def look(record: Record) -> Identification | None:
+        with suppress(_GivenUpError, np.linalg.LinAlgError):
+            return identify_record(replace(record, commands=None), options, go_on)
+        return None
+
+    def go_on(_: str) -> None:
+        if given_up.is_set():
+            raise _GivenUpError
+
+    estimate: Future[Identification | None] | None = None
+    beside = ThreadPoolExecutor(1, initializer=partial(os.nice, 5 * (sys.platform == 'linux')))
     with tqdm(
         total=options.duration, file=sys.stderr, disable=None, leave=False,
         bar_format='{desc} {percentage:3.0f} % |{bar:16}| {postfix}', desc='moving',
@@ -150,23 +137,24 @@ def _follow(
             bar.n = min(moved, options.duration)
             bar.set_postfix_str(said)
             if estimate is None and moved >= next_look:
-                estimate = _Estimate(record, options)
-            if estimate is None or estimate.found is None:
+                estimate = beside.submit(look, record)
+            if estimate is None or not estimate.done():
                 continue
-            found, said = estimate.found, _said(estimate.found)
-            next_look, estimate = growth * next_look, None
+            found, estimate, next_look = estimate.result(), None, 1.5 * next_look
+            if found is None:
+                continue
+            said = _said(found)
             line = f'{moved:5.1f} s  {said}'
             if bar.disable:
                 print(line, file=sys.stderr, flush=True)
             else:
                 bar.write(line, file=sys.stderr)
-            if found.usable and options.precision > 0.0 and max(
-                found.std['gap'] / found.gap if found.gap > 0.0 else inf,
-                float(found.response_std.max()),
-            ) <= options.precision:
+            if found.usable and max(found.std['gap'], found.gap * float(
+                    found.response_std.max())) <= options.precision * found.gap:
                 break
-    if estimate is not None:
-        estimate.given_up = True
+    # Without waiting for it: the node is to come to rest now.
+    given_up.set()
+    beside.shutdown(wait=False)
 
 
 def _said(found: Identification) -> str:

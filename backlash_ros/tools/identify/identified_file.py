@@ -21,7 +21,6 @@ NOT_TAKEN_OVER = (
     'truth', 'backlash', 'output_noise_std', 'output_quantum', 'input_disturbance', 'estimates',
     'bag', 'lockstep', 'wait_for_subscribers', 'wait_for_publishers', 'axes',
 )
-USUAL_FREQUENCY = np.pi / 10.0  # [rad/sample] at which tracking.input_weight takes |G|
 
 
 def identified_parameters(
@@ -106,7 +105,8 @@ def _reference(found: Identification, details: Details) -> dict[str, Value]:
 
 def _weights(found: Identification, details: Details) -> dict[str, Value]:
     """The usual weight of u, at a frequency where G is known and v still moves y."""
-    w = np.linspace(found.frequencies[0], USUAL_FREQUENCY, 200)
+    # To the frequency [rad/sample] at which tracking.input_weight takes |G|.
+    w = np.linspace(found.frequencies[0], np.pi / 10.0, 200)
     gain = np.abs(details.response.at(w))
     if found.actuator is not None:
         gain = gain * np.abs(found.actuator.lag.response(np.exp(1j * w)))
@@ -116,15 +116,11 @@ def _weights(found: Identification, details: Details) -> dict[str, Value]:
     if not len(beyond):
         return {}
     last = max(int(beyond[0]) - 1, 0)
-    usual_weight, usual_preview = (
-        BY_NAME[f'tracking.{name}'].default for name in ('input_weight', 'preview')
-    )
-    assert isinstance(usual_weight, float)
-    assert isinstance(usual_preview, int)
+    usual = Parameters().tracking
     return {
-        'tracking.input_weight': _short(usual_weight * max(gain[last] / gain[-1], 1.0)**2, 2),
+        'tracking.input_weight': _short(usual.input_weight * max(gain[last] / gain[-1], 1.0)**2, 2),
         # Nearly a period of that motion.
-        'tracking.preview': min(max(round(6.0 / w[last]), usual_preview), 600),
+        'tracking.preview': min(max(round(6.0 / w[last]), usual.preview), 600),
     }
 
 
@@ -144,30 +140,26 @@ def numbers(found: Identification) -> dict[str, Any]:
     """Content of identified.json."""
     held_out = found.details and found.details.held_out
     actuator = found.actuator
+    as_they_are = ('usable', 'reasons', 'remarks', 'm', 'gap', 'c_r', 'c_l', 'numerator',
+                   'denominator', 'integrator', 'sample_period', 'uncertainty', 'outliers')
     return {
-        'usable': found.usable, 'reasons': list(found.reasons), 'remarks': list(found.remarks),
+        **{name: getattr(found, name) for name in as_they_are},
         'known': None if found.verdict is None else {
             name: getattr(found.verdict, name)._asdict() for name in ('backlash', 'gain', 'model')
         },
-        'm': found.m, 'gap': found.gap, 'c_r': found.c_r, 'c_l': found.c_l,
         'offset': 0.5 * (found.c_r + found.c_l),
         'std': dict(found.std) or dict.fromkeys(('m', 'gap', 'c_r', 'c_l')),
-        'numerator': list(found.numerator), 'denominator': list(found.denominator),
-        'delay_samples': found.delay, 'equally_good_delays': list(found.delays),
-        'integrator': found.integrator, 'sample_period': found.sample_period,
+        'delay_samples': found.delay, 'equally_good_delays': found.delays,
         'output_noise_std': found.noise_std, 'output_quantum': found.quantum,
-        'uncertainty': found.uncertainty,
         'response': {
             'frequency_hz': hertz(found).tolist(), 'relative_std': found.response_std.tolist(),
         },
         'held_out': held_out and {'rms': held_out.rms, 'rms_of_fit': held_out.trained},
         'actuator': actuator and {
             'numerator': actuator.lag.numerator.tolist(),
-            'denominator': actuator.lag.denominator.tolist(), 'wind_up': list(actuator.wind_up),
+            'denominator': actuator.lag.denominator.tolist(), 'wind_up': actuator.wind_up,
         },
-        'residual': {'lag_one_correlation': found.correlation},
         'samples': len(found.y), 'lost_samples': int(np.isnan(found.y).sum()),
-        'outliers': found.outliers,
     }
 
 
@@ -176,31 +168,19 @@ def hertz(found: Identification) -> np.ndarray[Any, np.dtype[np.float64]]:
     return np.asarray(found.frequencies / (2.0 * np.pi * found.sample_period))
 
 
-def alike(found: Identification) -> str:
-    """Which delays fit alike, '' for one alone."""
-    few = len(found.delays) < 2
-    return '' if few else f' ({found.delays[0]} to {found.delays[-1]} fit alike)'
-
-
 def commented_yaml(
     parameters: Parameters, found: Identification, source: str, axis: str = '',
 ) -> str:
     """A parameter file that says of each value what it is and, where it was found, how surely."""
     band, std = hertz(found), found.std
     comments = {
-        'sample_period': 'of the record [s]',
         'plant.numerator': f'G to ± {100.0 * found.response_std.max():.2g} % from {band[0]:.2g} to '
                            f'{band[-1]:.2g} Hz; its gain is that for m = {found.m:g}, ± '
                            f'{100.0 * std["m"] / found.m:.2g} %',
-        'plant.denominator': f'{len(found.denominator) - 1} poles'
-                             + (', one of them an integrator' if found.integrator else ''),
-        'plant.uncertainty': 'twice the deviation of G, and 0.01 at least',
-        'control.delay_samples': f'found by comparison{alike(found)}',
         'estimator.initial.m': 'as told with --slope, 1 where it was not: G has the gain for it',
         'estimator.initial.c_r': f'± {std["c_r"]:.2g} [v]',
         'estimator.initial.c_l': f'± {std["c_l"]:.2g} [v]',
         'estimator.output_noise_std': 'deviation of y from the simulation [y]',
-        'estimates.file': 'm, c_r, c_l as found, with which the controller begins',
     }
     lines = [
         f'# Identified from {source}: {len(found.y)} samples of {found.sample_period:g} s.',

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -58,6 +58,12 @@ def read_bag_record(
         of_axis = f' of axis {axis}' if axis else ''
     record = from_messages(heard, period, of_axis)
     return replace(record, notes=tuple(filter(None, (note, *record.notes, damage))))
+
+
+def as_messages(pairs: Sequence[tuple[int, float]]) -> Messages:
+    """From a stamp [ns] and a value each."""
+    stamps, values = zip(*pairs, strict=True)
+    return np.array(stamps, dtype=np.int64), np.array(values, dtype=float)
 
 
 def from_messages(heard: Mapping[str, Messages], period: float | None, of_axis: str = '') -> Record:
@@ -160,7 +166,5 @@ def _signals(path: Path) -> tuple[dict[str, Signal], str]:
                 series.setdefault((topic, part, joint), []).append((stamp, float(value)))
     found = {}
     for (topic, part, joint), pairs in series.items():
-        stamps, values = zip(*pairs, strict=True)
-        messages_of = np.array(stamps, dtype=np.int64), np.array(values)
-        found[topic.removeprefix('/') + part] = Signal(messages_of, is_command(topic), joint)
+        found[topic.removeprefix('/') + part] = Signal(as_messages(pairs), is_command(topic), joint)
     return found, content.damage
