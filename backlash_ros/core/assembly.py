@@ -84,15 +84,12 @@ def build_controller(
     law = p.estimator.law
     if not law_fits(law, p.structure):
         only, why = ONLY_IN[law]
-        raise ParameterError(
-            'structure', p.structure, f'must be {only} for estimator.law: {law}',
-            f'{why}; moving_horizon, lms and fixed fit any structure',
-        )
+        raise ParameterError('structure', p.structure, f'must be {only} for estimator.law: {law}',
+                             f'{why}; moving_horizon, lms and fixed fit any structure')
     executor, actuator = executor or Executor(), build_actuator(p)
     estimator = build_law(p, estimate or known_before(p), executor)
     serial = None if actuator is None else SerialPlant(
-        actuator, build_state_model(p), p.estimator.output_noise_std
-    )
+        actuator, build_state_model(p), p.estimator.output_noise_std)
     return AdaptiveController(
         estimator, build_structure(p), inverse, build_limits(p), p.plant.adapt, serial, executor
     )
@@ -135,10 +132,8 @@ def build_structure(p: Parameters) -> ControlStructure:
     if p.structure == 'pole_placement':
         return PolePlacement(build_four_blocks(p))
     weights = Weights(p.tracking.input_weight, p.tracking.integral_weight, p.tracking.preview)
-    return Tracking(
-        design(build_state_model(p, commanded=True), weights), weights, p.inverse.caution,
-        p.estimator.output_noise_std,
-    )
+    return Tracking(design(build_state_model(p, commanded=True), weights), weights,
+                    p.inverse.caution, p.estimator.output_noise_std)
 
 
 def build_four_blocks(p: Parameters) -> FourBlocks:
@@ -153,9 +148,8 @@ def build_four_blocks(p: Parameters) -> FourBlocks:
 def build_limits(p: Parameters) -> Limits:
     """Limits of v per sample."""
     control, period = p.control, p.sample_period
-    return Limits(
-        control.min, control.max, control.rate_max * period, control.acceleration_max * period**2
-    )
+    return Limits(control.min, control.max, control.rate_max * period,
+                  control.acceleration_max * period**2)
 
 
 def build_state_model(p: Parameters, commanded: bool = False) -> StateModel:
@@ -202,19 +196,15 @@ def warnings_of(p: Parameters, with_reference: bool = True) -> list[str]:
 
 
 def _check_first_guess(p: Parameters) -> None:
-    initial = p.estimator.initial
+    initial, (low_f, high_f) = p.estimator.initial, p.proportional.bounds
     for name in ('m', 'c_r', 'c_l'):
         (low, high), value = getattr(p.estimator.bounds, name), getattr(initial, name)
         if low < high and not low <= value <= high:
-            raise ParameterError(
-                f'estimator.initial.{name}', value, f'must lie within [{low:g}, {high:g}]',
-                f'change it or estimator.bounds.{name}',
-            )
+            raise ParameterError(f'estimator.initial.{name}', value, f'must lie within [{low:g}, '
+                                 f'{high:g}]', f'change it or estimator.bounds.{name}')
     if initial.c_l > initial.c_r:
-        raise ParameterError(
-            'estimator.initial.c_l', initial.c_l,
-            f'must be <= estimator.initial.c_r={initial.c_r!r}',
-        )
-    low, high = p.proportional.bounds
-    if low >= high:
-        raise ParameterError('proportional.bounds', [low, high], 'must be [low, high], low < high')
+        raise ParameterError('estimator.initial.c_l', initial.c_l,
+                             f'must be <= estimator.initial.c_r={initial.c_r!r}')
+    if low_f >= high_f:
+        raise ParameterError('proportional.bounds', [low_f, high_f],
+                             'must be [low, high], low < high')

@@ -12,11 +12,6 @@ from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 
-# What a saved estimate depends on; a file for anything else is refused.
-KEY = (
-    'estimator.law', 'sample_period', 'plant.numerator', 'plant.denominator',
-    'control.delay_samples',
-)
 NEEDED, DEVIATIONS = ('m', 'c_r', 'c_l', 'f'), ('std_m', 'std_c_r', 'std_c_l')
 
 
@@ -63,8 +58,7 @@ def load_estimate(p: Parameters) -> Estimate | None:
     except (OSError, ValueError) as error:
         raise refused(f'cannot be read: {error}', 'delete it or name another one') from None
     try:
-        version, key, values = (content[part] for part in ('version', 'key', 'estimate'))
-        key = dict(key)
+        version, key, values = content['version'], dict(content['key']), content['estimate']
         m, c_r, c_l, f, std_m, std_c_r, std_c_l = (
             nan if values[part] is None else float(values[part])
             for part in (*NEEDED, *DEVIATIONS))
@@ -94,5 +88,8 @@ def load_estimate(p: Parameters) -> Estimate | None:
 
 
 def _key(p: Parameters) -> dict[str, object]:
-    return {name: list(value) if isinstance(value, tuple) else value
-            for name, value in ((name, p[name]) for name in KEY)}
+    """What a saved estimate depends on; a file for anything else is refused."""
+    names = ('estimator.law', 'sample_period', 'plant.numerator', 'plant.denominator',
+             'control.delay_samples')
+    # As JSON has them.
+    return {name: list(value) if isinstance(value := p[name], tuple) else value for name in names}
