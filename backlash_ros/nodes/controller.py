@@ -27,10 +27,13 @@ from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.jobs.executor import Executor
 from backlash_ros.core.jobs.worker import WorkerExecutor
 from backlash_ros.core.loop.control_loop import ControlLoop
+from backlash_ros.core.loop.diagnosis import Neighbours
+from backlash_ros.core.loop.driver_period import Timing
 from backlash_ros.core.loop.joint_loops import JointLoops
 from backlash_ros.core.loop.sample_counter import UNNUMBERED, Output, SampleCounter, kept_outputs
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import CONTROLLER
+from backlash_ros.nodes.control.diagnosis import neighbours_of
 from backlash_ros.nodes.control.joint import Joint
 from backlash_ros.nodes.control.publishing import StepPublisher
 from backlash_ros.nodes.control.rivals import RivalWatch
@@ -81,13 +84,14 @@ class ControllerNode(ManagedNode):
             p.sample_period, from_zero=not p.lockstep and p.wait_for_subscribers > 0
         )
         self._pairs = Pairs(deque(), deque(), deque())
+        self._around: tuple[Neighbours, Timing] | None = None  # at the newest look at the graph
+        self._news: deque[Joint] = deque()  # of whom there is something new to say
         self._driver: Subscription | None = None  # plant_output, once it may begin
         self._ending: Timer | None = None  # sends the commands of on_timeout
         self.joints: list[Joint] = []
         self._rivals = RivalWatch(
             self, self._io.topics.control, self._io.advertise, self._mind_rivals
         )
-        self._commands_of_rivals: Subscription | None = None  # heard while standing down
         self._steps = StepPublisher(self, p.joint_names)
         # A stalled controller goes on with the newest values; in lockstep none may be skipped.
         # Woken by each y_m, the process would take half as much time again.
@@ -107,7 +111,7 @@ class ControllerNode(ManagedNode):
 
         def look_and_tell() -> None:
             self._steps.look()
-            next(turn).diagnose(self._rivals, self.active)
+            self._diagnose(next(turn))
 
         self.create_timer(
             DIAGNOSTICS_PERIOD_S / len(self.joints), look_and_tell, clock=self.steady_clock
@@ -219,7 +223,7 @@ class ControllerNode(ManagedNode):
             loops.end(self.settings.on_stop)
             self._send_last(loops)
             for joint in self.joints:
-                joint.model.publish_last(loops.by_name[joint.name])
+                joint.model.publish_last(loops.by_name[joint.name], joint.p)
         self._rivals.begin(active=False)
         self._diagnose()
 
@@ -317,9 +321,12 @@ class ControllerNode(ManagedNode):
     def _follow_up(self, loops: JointLoops, steps: Mapping[str, ControlStep]) -> None:
         """Tell of the steps of a sample."""
         self._steps.publish(loops.by_name, steps)
-        for joint in self.joints:
-            if joint.name in steps and joint.follow(steps[joint.name]):
-                joint.diagnose(self._rivals, self.active)
+        self._news += [
+            joint for joint in self.joints
+            if joint.name in steps and joint.follow(steps[joint.name]) and joint not in self._news
+        ]
+        if self._news:
+            self._diagnose(self._news.popleft())
 
     # --- what happens besides --------------------------------------------------------------------
 
@@ -345,10 +352,10 @@ class ControllerNode(ManagedNode):
         if changing and stand_down:
             for loop in changing:
                 loop.stand_down()
-            self._commands_of_rivals = self._io.listen_to_commands(self._hear_rival)
+            self._rivals.commands = self._io.listen_to_commands(self._hear_rival)
         elif changing:
-            assert self._commands_of_rivals is not None
-            self.destroy_subscription(self._commands_of_rivals)
+            assert self._rivals.commands is not None
+            self.destroy_subscription(self._rivals.commands)
             for loop in changing:
                 loop.resume()
         self._diagnose()
@@ -380,9 +387,19 @@ class ControllerNode(ManagedNode):
             self.destroy_timer(self._ending)
             self._ending = None
 
-    def _diagnose(self) -> None:
-        for joint in self.joints:
-            joint.diagnose(self._rivals, self.active)
+    def _diagnose(self, *joints: Joint) -> None:
+        """Publish what is going on with these joints, or all."""
+        rivals, loops = self._rivals, self.loops
+        for joint in joints or self.joints:
+            # The graph and the times of messages are looked at once for all of them.
+            if joint is self.joints[0] or self._around is None:
+                timing = Timing(self.settings.sample_period) if loops is None \
+                    else loops.counter.sender.timing()
+                found = tuple(rival.name for rival in rivals.found)
+                self._around = (
+                    neighbours_of(self, self._io, self.settings, found), self._io.known_of(timing),
+                )
+            joint.diagnose(*self._around, rivals.claim, self.active)
 
 
 def main(args: list[str] | None = None) -> int:

@@ -11,7 +11,8 @@ from math import isfinite
 from tqdm import tqdm
 
 from backlash_ros.core.estimate import Status
-from backlash_ros.core.loop.diagnosis import LoopFigures, state_beside
+from backlash_ros.core.loop.diagnosis import Learning, LoopFigures, Neighbours, state_beside
+from backlash_ros.core.loop.driver_period import Timing
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.parameter import Value, as_yaml
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
@@ -65,7 +66,9 @@ def _once(parameters: Parameters, options: argparse.Namespace) -> None:
     law = loop.controller.estimator
     if law.estimate.status != Status.TRACKING:
         state = state_beside(set(), LoopFigures(
-            sample_period=parameters.sample_period, status=law.estimate.status, law=law.report))
+            timing=Timing(parameters.sample_period), around=Neighbours(),
+            learning=Learning(law.estimate.status, law.report),
+        ))
         print(f'at the end: {state.text}')
     print(f'report: {directory / REPORT_PAGE}')
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from backlash_ros.core.loop.diagnosis import figures_of_loop, findings_of
+from backlash_ros.core.loop.diagnosis import Neighbours, figures_of_loop, findings_of
 from backlash_ros.core.loop.finding import Level
 from backlash_ros.core.loop.loop_statistics import Lately
 from backlash_ros.core.parameters import Parameters
@@ -35,10 +35,11 @@ def blamed(
         controller.run(driver.reference(driver.tick * p.sample_period))
         if k % round(hz) == 0:
             loop = controller.loop
-            counts = {**loop.statistics.by_name(), 'dead_workers': 0}
             said = [
                 finding for finding in findings_of(figures_of_loop(
-                    loop, p, loop.counter.sender.newest(), lately.gained(counts, k / hz)))
+                    loop, p, loop.counter.sender.timing(), lately.gained(loop.counted, k / hz),
+                    Neighbours(),
+                ))
                 if finding.level > Level.OK and finding.kind not in OF_TOPICS
             ]
             texts += [finding.text for finding in said[:1]]

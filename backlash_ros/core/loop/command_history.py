@@ -87,10 +87,9 @@ class CommandHistory:
         counts: LoopStatistics | None = None,
     ) -> None:
         self.counts = counts or LoopStatistics()
-        self.newest_ns = 0
         self.trust, self.origin = ReportTrust(use), ReportOrigin()
+        self.newest_ns = self.output_ns = 0
         self._period_ns = sample_period_s * 1e9
-        self.output_ns = 0
         self._transit_ns = 0.0  # median time from one node to the other
         self._published: deque[tuple[int, float]] = deque(maxlen=KEPT_COMMANDS)
         self._reported: deque[tuple[int, float]] = deque(maxlen=KEPT_COMMANDS)
@@ -120,13 +119,11 @@ class CommandHistory:
         """
         # A driver that was held up reads y first, and then the commands that came meanwhile; what
         # left later than messages are under way was not there.
-        end = min(due_ns, end_ns)
-        latest_ns = [
-            end - i * self._period_ns - self._transit_ns for i in range(intervals - 1, -1, -1)
-        ]
-        self.counts.late += self._published[-1][0] >= latest_ns[0]
-        pairs = [self._at(each) for each in latest_ns]
-        return [v for v, _ in pairs], [other for _, other in pairs]
+        latest_ns = min(due_ns, end_ns) - self._transit_ns
+        times_ns = [latest_ns - i * self._period_ns for i in range(intervals - 1, -1, -1)]
+        self.counts.late += self._published[-1][0] >= times_ns[0]
+        acted, others = zip(*map(self._at, times_ns), strict=True)
+        return list(acted), list(others)
 
     def newest_report(self, end_ns: int) -> float:
         """The v reported for the interval that ended at end_ns, nan without one.

@@ -11,7 +11,6 @@ from typing import NamedTuple
 from backlash_ros.core.assembly import (
     build_controller,
     build_limits,
-    build_model,
     build_structure,
     first_guess,
 )
@@ -27,10 +26,10 @@ from backlash_ros.core.parameters import NOISE, Parameters
 
 
 class Driver(NamedTuple):
-    """What a loop can ask about its driver.
+    """What a loop can ask about its driver: the clock of its stamps, who else tells of it.
 
-    now_ns: the clock of the stamps. may_report: whether it may yet say which v acts. applied: the
-    name of these reports. warn: tells the user. steady_s: a clock that nobody sets [s].
+    may_report: whether it may yet say which v acts. applied: the name of these reports. warn: tells
+    the user. steady_s: a clock that nobody sets [s].
     """
 
     now_ns: Callable[[], int]
@@ -59,8 +58,7 @@ class ControlLoop:
 
     send: takes v to the driver. estimate: to begin with, None for what was known before. counter:
     goes on counting where another loop has ended. v: the command that acts; None, and then taken
-    for 0, as long as nobody knows (knows_v). executor: where fits are made, None for here. phase:
-    see phase.py. nominal: G(z) as the parameters have it.
+    for 0, as long as nobody knows (knows_v). executor: where fits are made, None for here.
     """
 
     def __init__(
@@ -69,7 +67,6 @@ class ControlLoop:
         executor: Executor | None = None,
     ) -> None:
         self.counter, self.heard, self.phase = counter, Newest(), Phase.BEGINS
-        self.nominal = build_model(p)
         # Within six deviations of its noise y stands still.
         counts = LoopStatistics(still_band=6.0 * p.estimator.output_noise_std)
         self.commands = CommandHistory(p.sample_period, report_use(p), counts)
@@ -81,8 +78,6 @@ class ControlLoop:
         self._p, self._send, self._driver = p, send, driver
         self._gap = NEXT_SAMPLE  # what is missing since the newest output that was used
         self._ending: Iterator[float] = iter(())  # commands that lead v to its end
-
-    # --- what it knows ---------------------------------------------------------------------------
 
     @property
     def estimate(self) -> Estimate:
@@ -100,8 +95,17 @@ class ControlLoop:
         return self.commands.counts
 
     @property
+    def counted(self) -> dict[str, int]:
+        """All counts by name, also of what LoopFigures has besides."""
+        statistics = self.statistics
+        return {
+            **statistics.by_name(), 'wraps': statistics.wraps,
+            'dead_workers': self.executor.restarts,
+        }
+
+    @property
     def unreferred_s(self) -> float:
-        """Time since the newest reference [s], 0 before the first."""
+        """Since the newest reference [s], 0 before the first."""
         at = self.heard.y_m_at
         return 0.0 if at is None else self._driver.steady_s() - at
 
@@ -109,11 +113,6 @@ class ControlLoop:
     def begins(self) -> bool:
         """Whether the next command is the first one, since the start or an interruption."""
         return self.phase in (Phase.BEGINS, Phase.SILENT)
-
-    @property
-    def silent(self) -> bool:
-        """Whether the driver was given up for the time being."""
-        return self.phase is Phase.SILENT
 
     @property
     def standing_down(self) -> bool:
@@ -145,26 +144,24 @@ class ControlLoop:
         newest one.
         """
         if arrival is None:
-            arrival = self.counter.count(output.stamp_ns, output.sequence, output.numbered)
+            arrival = self.counter.count(*output.counted)
         if y_m is None:
             y_m = self.heard.y_m
-        statistics, step = self.statistics, None
-        if self._is_usable(output, arrival, y_m):
-            step = self._step_core(output.y, y_m, output.stamp_ns)
-            self.send(step.v)
-            latency_s = (time.time_ns() - output.sent_ns) * 1e-9
-            statistics.note(
-                output.y, step.v, self.core.inverse.limited,
-                step.estimate.status is Status.INCONSISTENT, latency_s,
-            )
-        statistics.note_arrival(output.stamp_ns, output.received_ns)
+        if not self._is_usable(output, arrival, y_m):
+            return None
+        step = self._step_core(output.y, y_m, output.stamp_ns)
+        self.send(step.v)
+        self.statistics.note(
+            output.y, step.v, self.core.inverse.limited,
+            step.estimate.status is Status.INCONSISTENT, (time.time_ns() - output.sent_ns) * 1e-9,
+        )
         return step
 
     def skip(self, arrival: Arrival) -> None:
         """Leave a sample unanswered of which this loop has no output."""
         if arrival.is_sample and not self.standing_down:
             self._note_missing(arrival)
-            self._note_missing(Arrival(True, missing=1), lost=False)
+            self._note_missing(Arrival(missing=1), lost=False)
 
     def send(self, v: float) -> None:
         """Send a command and note when it left; nothing while another controller commands."""
@@ -179,13 +176,11 @@ class ControlLoop:
     def _is_usable(self, output: Output, arrival: Arrival, y_m: float) -> bool:
         """Count a message of y; returns whether there is a command to be made of it."""
         statistics = self.statistics
-        if self.standing_down:
-            return False
-        if not arrival.is_sample:
-            statistics.extra += 1
+        if self.standing_down or not arrival.is_sample:
+            statistics.extra += not self.standing_down
             return False
         self.commands.note_transit(output.received_ns - output.sent_ns)
-        if arrival.missing or arrival.restarted:
+        if arrival is not NEXT_SAMPLE:
             self._note_missing(arrival)
         if plausible(output.y):
             self.heard.y_at = self._driver.steady_s()
@@ -195,7 +190,7 @@ class ControlLoop:
         else:
             # A sensor that has nothing to say is as good as silent.
             statistics.bad_outputs += 1
-        self._note_missing(Arrival(True, missing=1), lost=False)
+        self._note_missing(Arrival(missing=1), lost=False)
         return False
 
     def _note_missing(self, arrival: Arrival, lost: bool = True) -> None:
@@ -211,17 +206,15 @@ class ControlLoop:
 
     def _may_answer(self, output: Output) -> bool:
         """Begin anew where too much is missing; returns whether a v to go on from is known."""
-        p, gap = self._p, self._gap
-        if gap is not NEXT_SAMPLE or self.silent:
-            too_long = gap.missing > LONGEST_GAP or (
-                not p.lockstep
-                and 0.0 < p.timeout.plant_output < gap.missing * p.sample_period
-            )
-            if self.silent or gap.restarted or (too_long and self.phase is Phase.RUNS):
-                self.statistics.interruptions += 1
-                self._happens(Event.INTERRUPTION)
-                self.commands.origin.restart()
-                self._renew_core(self.estimate)
+        p, gap, silent = self._p, self._gap, self.phase is Phase.SILENT
+        stalled = not p.lockstep \
+            and 0.0 < p.timeout.plant_output < gap.missing * p.sample_period
+        too_long = self.phase is Phase.RUNS and (gap.missing > LONGEST_GAP or stalled)
+        if silent or gap.restarted or too_long:
+            self.statistics.interruptions += 1
+            self._happens(Event.INTERRUPTION)
+            self.commands.origin.restart()
+            self._renew_core(self.estimate)
         return self.phase is Phase.RUNS or p.lockstep or self._may_begin(output)
 
     def _may_begin(self, output: Output) -> bool:
@@ -283,8 +276,6 @@ class ControlLoop:
         )
         self.renew(self.heard.before_reports)
         return True
-
-    # --- the phases ------------------------------------------------------------------------------
 
     @property
     def is_overdue(self) -> bool:
@@ -383,10 +374,9 @@ class ControlLoop:
         core.inverse.direction_band = p.inverse.direction_band
         core.inverse.take_up = p.inverse.take_up_rate * p.sample_period
         core.estimator.retune(p)
-        of_the_structure = (
+        if any(p[name] != before[name] for name in (
             'tracking.input_weight', 'tracking.integral_weight', 'inverse.caution', NOISE,
-        )
-        if any(p[name] != before[name] for name in of_the_structure):
+        )):
             structure = build_structure(p)
             structure.go_on_from(core.structure)
             core.structure = structure

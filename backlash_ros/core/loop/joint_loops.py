@@ -11,6 +11,7 @@ from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.jobs.executor import Executor
 from backlash_ros.core.loop.control_loop import ControlLoop, Driver
+from backlash_ros.core.loop.phase import Phase
 from backlash_ros.core.loop.sample_counter import Output, SampleCounter
 from backlash_ros.core.parameters import Parameters
 
@@ -29,8 +30,7 @@ class JointLoops:
         counter: SampleCounter, v: Mapping[str, float | None] | None = None,
         executor: Executor | None = None,
     ) -> None:
-        self.counter, self._send = counter, send
-        self._together = p.io.together
+        self.counter, self._send, self._together = counter, send, p.io.together
         self._commands: dict[str, float] = {}  # that wait for the message
         self.by_name = {
             joint: ControlLoop(
@@ -50,21 +50,20 @@ class JointLoops:
 
         y_m: as in ControlLoop.answer.
         """
-        first = next(iter(outputs.values()))
-        arrival = self.counter.count(first.stamp_ns, first.sequence, first.numbered)
+        arrival = self.counter.count(*next(iter(outputs.values())).counted)
         if self._together and any(
-            loop.silent and not (joint in outputs and isfinite(outputs[joint].y))
+            loop.phase is Phase.SILENT and not (joint in outputs and isfinite(outputs[joint].y))
             for joint, loop in self.by_name.items()
         ):
             outputs = {}  # an arm of which one joint is still lost does not begin
         steps = {}
         for joint, loop in self.by_name.items():
-            output = outputs.get(joint)
-            if output is None:
+            if joint not in outputs:
                 loop.skip(arrival)
-            elif (step := loop.answer(output, arrival, y_m)) is not None:
+            elif (step := loop.answer(outputs[joint], arrival, y_m)) is not None:
                 steps[joint] = step
         self._send_waiting()
+        # What the next commands need not wait for then.
         self.counter.sender.learn()
         for joint in steps:
             self.by_name[joint].core.structure.prepare()

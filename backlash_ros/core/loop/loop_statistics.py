@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from itertools import pairwise
 from math import inf, nan, pi
 
 import numpy as np
@@ -27,7 +26,6 @@ class Counts:
     extra: int = 0  # outputs that were repeated, too early, old or of a second driver
     interruptions: int = 0  # times that the driver was silent or restarted
     limited: int = 0  # commands that met a limit
-    wraps: int = 0  # times that y jumped by 2 pi
 
     @property
     def dropped(self) -> int:
@@ -44,34 +42,27 @@ class LoopStatistics(Counts):
     """Counts since the loop began, and what tells how well it runs now.
 
     still_band: by how much y may differ where it stands still. still: newest values of y in a row
-    that are equal. inconsistent: newest samples in a row that contradict the estimate. latencies
-    [s]: the newest ones, as topics.py defines them.
+    that are equal; still_v: lowest and highest v meanwhile. v_range: those since they were asked
+    for. wraps: times that y jumped by 2 pi. inconsistent: newest samples in a row that contradict
+    the estimate. latencies [s]: the newest ones, as topics.py defines them.
     """
 
     still_band: float = 0.0
     still: int = 0
+    still_v: tuple[float, float] = (inf, -inf)
+    v_range: tuple[float, float] = (inf, -inf)
+    wraps: int = 0
     inconsistent: int = 0
     latencies: deque[float] = field(default_factory=lambda: deque(maxlen=1000))
-    _stamps_ns: deque[int] = field(default_factory=lambda: deque(maxlen=51))
-    _ages_s: deque[float] = field(default_factory=lambda: deque(maxlen=50))
     _y: float = nan  # with which the newest row of equal values began
     _y_before: float = nan
     _pace: float = inf  # how far y moves from sample to sample, as a rule
-    _v_low: float = inf
-    _v_high: float = -inf
-    _still_low: float = inf
-    _still_high: float = -inf
 
     @property
     def still_swing(self) -> float:
         """How far v has moved while y stands still."""
-        return max(self._still_high - self._still_low, 0.0)
-
-    def note_arrival(self, stamp_ns: int, received_ns: int) -> None:
-        """Note a message of y, whatever it is worth: when it left and when it came."""
-        self._stamps_ns.append(stamp_ns)
-        if received_ns > 0:  # else the middleware does not tell
-            self._ages_s.append((received_ns - stamp_ns) * 1e-9)
+        low, high = self.still_v
+        return max(high - low, 0.0)
 
     def note(self, y: float, v: float, limited: bool, inconsistent: bool, latency: float) -> None:
         """Count an output and the command that it brought."""
@@ -79,7 +70,7 @@ class LoopStatistics(Counts):
         self.limited += limited
         self.inconsistent = self.inconsistent + 1 if inconsistent else 0
         self.latencies.append(latency)
-        self._v_low, self._v_high = min(v, self._v_low), max(v, self._v_high)
+        self.v_range = _with(v, self.v_range)
         moved = abs(y - self._y_before)
         # A jump by about a turn, and much further than y moves as a rule.
         if abs(moved - 2.0 * pi) < 0.3 and moved > 10.0 * self._pace:
@@ -88,37 +79,23 @@ class LoopStatistics(Counts):
             self._pace = moved if self._pace == inf else self._pace + 0.05 * (moved - self._pace)
         self._y_before = y
         if not abs(y - self._y) <= self.still_band:
-            self._y, self.still, self._still_low, self._still_high = y, 0, v, v
+            self._y, self.still, self.still_v = y, 0, (v, v)
         self.still += 1
-        self._still_low, self._still_high = min(v, self._still_low), max(v, self._still_high)
+        self.still_v = _with(v, self.still_v)
 
     def latencies_ms(self, *shares: float) -> list[float]:
         """Latencies that these shares of the latest commands stayed below; nan without any."""
         return [1e3 * float(each) for each in np.quantile(self.latencies or [nan], shares)]
 
-    def intervals_s(self) -> tuple[float, float, float]:
-        """Newest intervals between messages of y: low, mean and high [s]; nan while few.
-
-        A tenth of them is shorter than low, a tenth longer than high.
-        """
-        intervals = sorted(later - earlier for earlier, later in pairwise(self._stamps_ns))
-        if len(intervals) < 20:
-            return nan, nan, nan
-        tenth, mean = len(intervals) // 10, sum(intervals) / len(intervals)
-        return 1e-9 * intervals[tenth], 1e-9 * mean, 1e-9 * intervals[-1 - tenth]
-
-    def age_s(self) -> float:
-        """Median of the newest times from stamp to arrival [s]; nan while few.
-
-        Negative where the clock of the driver is ahead of the one of this machine.
-        """
-        return float(np.median(self._ages_s)) if len(self._ages_s) >= 20 else nan
-
     def swing(self) -> float:
         """Swing of v since the last call."""
-        swing = max(self._v_high - self._v_low, 0.0)
-        self._v_low, self._v_high = inf, -inf
-        return swing
+        (low, high), self.v_range = self.v_range, (inf, -inf)
+        return max(high - low, 0.0)
+
+
+def _with(value: float, bounds: tuple[float, float]) -> tuple[float, float]:
+    low, high = bounds
+    return min(value, low), max(value, high)
 
 
 class Lately:

@@ -14,12 +14,6 @@ UNNUMBERED = 2**64 - 1
 # Jitter of the sender up to this share of a period is not taken for a loss.
 JITTER = 0.85
 CLOCK_SLACK = 0.01  # share of a period by which the sender's clock may run slow per sample
-# A sender that has kept time for so many samples is held to it: what comes much earlier than the
-# next sample is due is a repetition or from someone else.
-KEEPS_TIME_AFTER = 20
-# Samples in a row that all came later than expected, after which the least lateness among them is
-# the new phase of the sender, which has paused: at its start, and when its period is known.
-PHASE_AT_START, PHASE_SAMPLES = 6, 20
 
 
 class Output(NamedTuple):
@@ -36,6 +30,11 @@ class Output(NamedTuple):
     sequence: int
     numbered: bool = True
 
+    @property
+    def counted(self) -> tuple[int, int, bool, int]:
+        """What a counter asks for."""
+        return self.stamp_ns, self.sequence, self.numbered, self.received_ns
+
 
 class Arrival(NamedTuple):
     """What a message is.
@@ -46,13 +45,13 @@ class Arrival(NamedTuple):
     the plant did in between.
     """
 
-    is_sample: bool
+    is_sample: bool = True
     missing: int = 0
     restarted: bool = False
     unsent: int = 0
 
 
-NO_SAMPLE, NEXT_SAMPLE = Arrival(is_sample=False), Arrival(is_sample=True)
+NO_SAMPLE, NEXT_SAMPLE = Arrival(is_sample=False), Arrival()
 
 
 class SampleCounter:
@@ -73,21 +72,29 @@ class SampleCounter:
         self.index, self.due_ns = -1, 0.0
         self.sender = DriverPeriod(sample_period_s)
         self._from_zero = from_zero
-        self._sequence = 0  # of the newest sample
-        self._repeated = 0  # of the newest message that followed it too early to be a sample
-        self._stamp_ns = 0  # of the newest sample
+        self._stamp_ns = self._sequence = 0  # of the newest sample
+        self._repeated = 0  # number of the newest message that followed it too early to be one
         self._early_ns = 0.0  # the earliest time at which the newest sample may have been due
-        self._lateness_ns: deque[float] = deque(maxlen=PHASE_SAMPLES)  # before any shift
+        self._lateness_ns: deque[float] = deque(maxlen=20)  # before any shift
         self._shifted_ns = 0.0  # by how much due_ns was shifted so far
         self._on_time = 0  # samples that came when they were due, less the early ones
         self._strange = 0  # messages in a row that do not follow the newest sample
 
-    def count(self, stamp_ns: int, sequence: int = UNNUMBERED, numbered: bool = True) -> Arrival:
-        """Take in a message and say what it is; `numbered` as in Output."""
+    @property
+    def _keeps_time(self) -> bool:
+        """Whether what comes much earlier than the next sample is due is refused."""
+        return self._on_time >= 20
+
+    def count(
+        self, stamp_ns: int, sequence: int = UNNUMBERED, numbered: bool = True,
+        received_ns: int = 0,
+    ) -> Arrival:
+        """Take in a message and say what it is; the arguments are those of Output."""
         known = sequence != UNNUMBERED
         numbered = numbered and known
+        self.sender.hear(stamp_ns, received_ns)
         self.sender.learn()
-        period = self.sender.period_ns
+        period, keeps_time = self.sender.period_ns, self._keeps_time
         if self.index < 0:
             if not self._from_zero:
                 self.index = round(stamp_ns / period)
@@ -96,10 +103,9 @@ class SampleCounter:
             self._begin(stamp_ns, sequence)
             return NEXT_SAMPLE
         if stamp_ns < self._stamp_ns:
-            return self._stranger(stamp_ns, sequence)
+            return self._of_another(stamp_ns, sequence)
         late = (stamp_ns - self.due_ns) / period - 1.0  # [periods], may be negative
         is_early = stamp_ns < self._early_ns + 0.7 * period
-        keeps_time = self._on_time >= KEEPS_TIME_AFTER
         by_time = max(int(late + 1.0 - JITTER), 0)
         skipped = 0  # numbers between this message and the newest one of its sender
         if known:
@@ -110,8 +116,7 @@ class SampleCounter:
                 if keeps_time and not silent:
                     return NO_SAMPLE
                 # Two senders in turn must not each look like one that restarted.
-                begin = self._stranger if keeps_time or not silent else self._restarted
-                return begin(stamp_ns, sequence, by_time)
+                return self._of_another(stamp_ns, sequence, by_time, silent and not keeps_time)
             if not numbered and is_early and skipped > 0:
                 return NO_SAMPLE  # of another sender
             # Numbers may jump some samples further than time has passed.
@@ -136,7 +141,7 @@ class SampleCounter:
         self.index += 1 + missing
         if not missing:
             return NEXT_SAMPLE
-        return Arrival(True, missing, unsent=max(missing - skipped, 0) if known else 0)
+        return Arrival(missing=missing, unsent=max(missing - skipped, 0) if known else 0)
 
     def _follow_phase(self, stamp_ns: int, missing: int) -> None:
         """Go on to the sample with this stamp, before which so many are missing."""
@@ -145,27 +150,28 @@ class SampleCounter:
         late = stamp_ns - expected
         latenesses.append(late + self._shifted_ns)
         shift = min(late, period * CLOCK_SLACK)
-        if shift > 0.0:
-            window = PHASE_SAMPLES if self._on_time >= KEEPS_TIME_AFTER else PHASE_AT_START
-            if len(latenesses) >= window:
-                least = min(islice(reversed(latenesses), window))
-                shift = max(shift, least - self._shifted_ns)
+        # Where so many in a row all came later than expected, the sender has paused, and the least
+        # lateness among them is its new phase.
+        window = 20 if self._keeps_time else 6
+        if shift > 0.0 and len(latenesses) >= window:
+            least = min(islice(reversed(latenesses), window))
+            shift = max(shift, least - self._shifted_ns)
         self._shifted_ns += shift
         self.due_ns = expected + shift
         # Who was held up for some samples comes back to the old phase: this one lags behind.
         early = self._early_ns + period * (1 + missing + CLOCK_SLACK)
         self._early_ns = max(min(early, stamp_ns), self.due_ns - 0.5 * period)
 
-    def _stranger(self, stamp_ns: int, sequence: int, missing: int = 0) -> Arrival:
-        """Another sender, or a clock that was set back: believed after so many messages."""
+    def _of_another(
+        self, stamp_ns: int, sequence: int, missing: int = 0, at_once: bool = False,
+    ) -> Arrival:
+        """Another sender, or a clock that was set back: mostly believed after some messages."""
         self._strange += 1
-        return NO_SAMPLE if self._strange < 5 \
-            else self._restarted(stamp_ns, sequence, missing)
-
-    def _restarted(self, stamp_ns: int, sequence: int, missing: int) -> Arrival:
+        if self._strange < 5 and not at_once:
+            return NO_SAMPLE
         self.index += 1 + missing
         self._begin(stamp_ns, sequence)
-        return Arrival(is_sample=True, missing=missing, restarted=True)
+        return Arrival(missing=missing, restarted=True)
 
     def _begin(self, stamp_ns: int, sequence: int) -> None:
         self._sequence = self._repeated = sequence
@@ -177,8 +183,8 @@ class SampleCounter:
 
 
 def kept_outputs(sample_period: float) -> int:
-    """How many outputs wait for a controller that is held up; sample_period [s].
+    """How many outputs wait for a controller that is held up, which learns from all of them.
 
-    After so many samples, or so long, it still learns from all of them.
+    sample_period [s].
     """
     return round(max(0.1 / sample_period, 20))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from math import isfinite
 from pathlib import Path
@@ -12,21 +13,19 @@ from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.estimates_file import save_estimate, worth_saving
 from backlash_ros.core.loop.control_loop import ControlLoop, Driver
-from backlash_ros.core.loop.diagnosis import OF_MESSAGES, findings_of
+from backlash_ros.core.loop.diagnosis import (
+    OF_MESSAGES,
+    Neighbours,
+    figures_of_loop,
+    findings_of,
+)
+from backlash_ros.core.loop.driver_period import Timing
 from backlash_ros.core.loop.finding import Finding, Level
 from backlash_ros.core.loop.loop_statistics import Lately
 from backlash_ros.core.parameters import NOISE, Parameters
 from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.nodes.control.diagnosis import (
-    counts_of,
-    details_of,
-    figures_of,
-    missing_joint,
-    values_of,
-    worst,
-)
+from backlash_ros.nodes.control.diagnosis import counts_of, details_of, missing_joint, values_of
 from backlash_ros.nodes.control.publishing import ModelPublisher
-from backlash_ros.nodes.control.rivals import RivalWatch
 from backlash_ros.nodes.runtime.driver_io import DriverIo
 from backlash_ros.nodes.runtime.messages import DiagnosticsPublisher
 from backlash_ros.nodes.runtime.process import ProcessNode
@@ -75,7 +74,7 @@ class Joint:
     def begin(self, loop: ControlLoop, before: Estimate) -> None:
         """Take a new loop."""
         self.loop = loop
-        self.model.publish(loop)
+        self.model.publish(loop, self.p)
         if before.learned:
             self._node.log.info(
                 f'going on with the estimates in {self.p.estimates.file}: m={before.m:.6g}, '
@@ -94,7 +93,7 @@ class Joint:
         """Tell of a step; returns whether there is something new to say in /diagnostics."""
         loop = self.loop
         assert loop is not None
-        self.model.follow(loop, self.p.sample_period)
+        self.model.follow(loop, self.p)
         before, self.told = self.told, (loop.phase, step.estimate.status)
         return self.told != before
 
@@ -139,28 +138,28 @@ class Joint:
         if 0.0 < self.p.estimates.save_period < time.monotonic() - self._saved_at:
             self.save()
 
-    def diagnose(self, rivals: RivalWatch, active: bool) -> None:
-        """Publish what is going on to /diagnostics."""
-        loop, p, claim, publish = self.loop, self.p, rivals.claim, self._diagnostics.publish
+    def diagnose(
+        self, around: Neighbours, timing: Timing, claim: Mapping[str, object], active: bool,
+    ) -> None:
+        """Publish what is going on to /diagnostics. claim: what the node says in each of them."""
+        loop, p, publish = self.loop, self.p, self._diagnostics.publish
         if loop is None:
             publish(Finding(Level.OK, 'unconfigured', 'unconfigured'), claim)
             return
-        period = loop.counter.sender.newest()
-        values = {**values_of(loop, period), **claim}
+        values = {**values_of(loop, timing), **claim}
         if not active:
             text = f'inactive: no {self._io.topics.control} is published'
             publish(Finding(Level.OK, 'inactive', text), values)
             return
-        counts = {**loop.statistics.by_name(), 'dead_workers': loop.executor.restarts}
-        figures = figures_of(
-            self._node, self._io, loop, p, period, self._lately.gained(counts, time.monotonic()),
-            tuple(rival.name for rival in rivals.found),
-        )
+        gained = self._lately.gained(loop.counted, time.monotonic())
+        figures = figures_of_loop(loop, p, timing, gained, around)
         findings = [*missing_joint(self._io, self.name, p), *findings_of(figures)]
-        finding = worst(findings)
+        # The likeliest cause at the highest level that was found.
+        worst = max(findings, key=lambda finding: finding.level > Level.OK)
+        worst = worst._replace(level=max(finding.level for finding in findings))
         # What is true of all joints the first one says in the log.
-        speaks = self.name == self._io.joint_names[0] or finding.kind not in OF_MESSAGES
-        publish(finding, {**details_of(findings, figures), **values}, logs=speaks)
+        speaks = self.name == self._io.joint_names[0] or worst.kind not in OF_MESSAGES
+        publish(worst, {**details_of(findings, around), **values}, logs=speaks)
 
     def close(self) -> None:
         """Wait until everything is written, and say in the log what was counted."""

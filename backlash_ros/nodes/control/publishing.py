@@ -15,17 +15,15 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Float64, Float64MultiArray, MultiArrayDimension
 
 from backlash_ros import topics
+from backlash_ros.core.assembly import build_model
 from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.learned_model import learned_model_of
+from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.transfer_function import StateModel
 from backlash_ros.core.simulation.run_record import stated_deviations
 from backlash_ros.nodes.runtime.messages import LabelledArrayPublisher, without_events
 
-WATCH_PERIOD_S = 0.04  # between two messages of a topic; a loop at 1 kHz has no time for many more
-# Who comes late gets the newest ones: G may never change again. More than one, so that a subscriber
-# that is held up misses none, and one of each joint.
-NEWEST = QoSProfile(depth=20, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 Row = tuple[float, ...]
 
 
@@ -35,6 +33,8 @@ class WatchPublisher:
     Of a joint that has a name: `controller/watch/<joint>/<label>`. After v(k) comes the u that it
     led to, which is known with y(k+1): points of their loop.
     """
+
+    PERIOD_S = 0.04  # between two messages of a topic; a loop at 1 kHz has no time for many more
 
     def __init__(self, node: Node, joint: str = '') -> None:
         self._publishers: dict[str, Publisher] = {
@@ -68,7 +68,7 @@ class WatchPublisher:
         self._u_waits = due
         if due:
             # After a pause each is due once.
-            self._due_s = max(self._due_s, now_s - WATCH_PERIOD_S) + WATCH_PERIOD_S
+            self._due_s = max(self._due_s, now_s - self.PERIOD_S) + self.PERIOD_S
 
 
 def watched_values(signals: Row, estimates: Row) -> dict[str, float]:
@@ -144,31 +144,34 @@ class ModelPublisher:
     """
 
     def __init__(self, node: Node, joint: str) -> None:
+        # Who comes late gets the newest ones: G may never change again. More than one, so that a
+        # subscriber that is held up misses none, and one of each joint.
+        newest = QoSProfile(depth=20, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._publisher = node.create_publisher(
-            Float64MultiArray, topics.of_node(topics.MODEL), NEWEST,
+            Float64MultiArray, topics.of_node(topics.MODEL), newest,
             event_callbacks=without_events(),
         )
         self._joint = joint
         # The newest one that followed a sample, and the number of that.
         self._told: tuple[StateModel | None, float] = None, -inf
 
-    def follow(self, loop: ControlLoop, sample_period_s: float) -> None:
+    def follow(self, loop: ControlLoop, p: Parameters) -> None:
         """Publish after a sample, if it is time."""
         learned, index, (told, told_index) = \
             loop.core.estimator.learned_model, loop.counter.index, self._told
         # Deviations and noise change with every few samples, and are of use to a reader.
-        if learned is not told or (index - told_index) * sample_period_s >= 1.0:
+        if learned is not told or (index - told_index) * p.sample_period >= 1.0:
             self._told = learned, index
-            self.publish(loop)
+            self.publish(loop, p)
 
-    def publish_last(self, loop: ControlLoop) -> None:
+    def publish_last(self, loop: ControlLoop, p: Parameters) -> None:
         """Publish before the end, and wait until who listens has it: a recorder ends next."""
-        self.publish(loop)
+        self.publish(loop, p)
         self._publisher.wait_for_all_acked(Duration(seconds=1))
 
-    def publish(self, loop: ControlLoop) -> None:
+    def publish(self, loop: ControlLoop, p: Parameters) -> None:
         """Publish at once."""
-        fields = learned_model_of(loop.core.estimator, loop.nominal).fields()
+        fields = learned_model_of(loop.core.estimator, build_model(p)).fields()
         message = Float64MultiArray()
         message.layout.dim = [
             MultiArrayDimension(label=topics.of_joint(label, self._joint), size=len(values))

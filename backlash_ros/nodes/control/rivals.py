@@ -140,6 +140,7 @@ class RivalWatch:
         self._others: frozenset[str] = frozenset()
         self._hello_until = -inf  # until then others are told at every look who was first
         self._diagnostics: Subscription | None = None  # listened to only beside others
+        self.commands: Subscription | None = None  # of who is in charge, if it is another one
         node.create_timer(0.2, self.look, clock=node.steady_clock)
 
     @property

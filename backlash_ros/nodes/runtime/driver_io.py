@@ -16,6 +16,7 @@ from std_msgs.msg import Float64, Float64MultiArray
 
 from backlash_ros import topics
 from backlash_ros.core.loop.command_history import KEPT_COMMANDS
+from backlash_ros.core.loop.driver_period import Timing
 from backlash_ros.core.loop.sample_counter import Output
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
@@ -137,6 +138,12 @@ class DriverIo:
     def stamp_ns(self, info: dict[str, Any]) -> int:
         """When a message left, on the clock of the stamps."""
         return self.now_ns() if self.simulated_time else int(info['source_timestamp'])
+
+    def known_of(self, timing: Timing) -> Timing:
+        """What the stamps of the messages tell of the driver."""
+        # Those of simulated time have nothing to do with the time of arrival.
+        age_s = nan if self.simulated_time else timing.age_s
+        return timing._replace(age_s=age_s, repeats_stamps=self.stamps.repeated)
 
     def listen(
         self, hear: Callable[[Mapping[str, Output]], None], depth: int, polled: bool = False,

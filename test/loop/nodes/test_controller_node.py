@@ -11,6 +11,8 @@ from lifecycle_msgs.msg import Transition
 from node_in_process import Bench, bench, look_for_silence
 from std_srvs.srv import Trigger
 
+from backlash_ros.core.loop.phase import Phase
+
 RATE_MAX = 400.0
 STEP = RATE_MAX * 0.01 * (1.0 + 1e-9)
 GAP = 5.0  # less than that of the plant
@@ -87,14 +89,14 @@ def test_the_commands_of_a_silence_are_as_on_timeout_says(action: str) -> None:
             made.run(1)
         before = len(made.sent)
         look_for_silence(made.node)
-        assert made.loop.silent
+        assert made.loop.phase is Phase.SILENT
         if action != 'hold':
             made.wait_until(lambda: made.sent[-1] == 0.0, 'v at 0')
         ended = len(made.sent)
         assert (ended == before) == (action == 'hold')
         made.run(50)
         assert made.loop.statistics.interruptions == 1
-        assert not made.loop.silent
+        assert made.loop.phase is Phase.RUNS
         assert np.abs(np.diff(made.sent)).max() <= STEP
 
 

@@ -1,6 +1,6 @@
 """What the controller says is wrong with the loop, from figures alone."""
 
-from dataclasses import replace
+from dataclasses import replace as replaced
 from itertools import product
 from math import inf, nan
 from typing import Any
@@ -12,22 +12,37 @@ from backlash_ros.core.law import LawReport, OutOfBounds
 from backlash_ros.core.loop.diagnosis import (
     LONGEST_TEXT,
     UNNAMED,
+    Learning,
     LoopFigures,
+    Neighbours,
     Peer,
     TopicFigures,
     causes_of,
     findings_of,
 )
-from backlash_ros.core.loop.driver_period import Period
+from backlash_ros.core.loop.driver_period import Period, Timing
 from backlash_ros.core.loop.finding import Finding, Level
 
 DRIVER, OTHER = Peer('/driver', 'Float64'), Peer('/other', 'Float64')
 WELL = LoopFigures(
-    sample_period=0.005, output=TopicFigures('plant_output', peers=(DRIVER,)),
-    reference=TopicFigures('reference', peers=(Peer('/reference', 'Float64'),)),
-    control=TopicFigures('control', peers=(DRIVER,)), status=Status.TRACKING,
-    intervals_s=(0.005, 0.005, 0.005), used=600,
+    timing=Timing(0.005, intervals_s=(0.005, 0.005, 0.005)),
+    around=Neighbours(
+        TopicFigures('plant_output', peers=(DRIVER,)),
+        TopicFigures('reference', peers=(Peer('/reference', 'Float64'),)),
+        TopicFigures('control', peers=(DRIVER,)),
+    ), learning=Learning(Status.TRACKING), used=600,
 )
+
+
+def replace(figures: LoopFigures, **changes: Any) -> LoopFigures:
+    """With other values, of whichever part of the figures has them."""
+    for part in ('timing', 'around', 'learning'):
+        present = getattr(figures, part)
+        own = {name: changes.pop(name) for name in present._fields if name in changes}
+        changes[part] = present._replace(**own)
+    return replaced(figures, **changes)
+
+
 INCONSISTENT = replace(WELL, status=Status.INCONSISTENT)
 LEARNED = Finding(Level.OK, 'learned', 'learned: the estimates agree with the data')
 BLAMED = 'plant_output does not follow from v through G(z): check G(z), the sensor, the actuator'
@@ -76,7 +91,7 @@ CASES: list[tuple[dict[str, Any], Level, str]] = [
     ({'bad_outputs': 600, 'used': 0}, Level.ERROR,
      '100 % of plant_output is no finite number: check the sensor'),
     ({'bad_outputs': 60}, Level.WARN, '9.09 % of plant_output is no finite number'),
-    ({'bad_references': 3, 'referred': False, 'status': None, 'used': 0,
+    ({'bad_references': 3, 'reference_silent_s': inf, 'status': None, 'used': 0,
       'without_reference': 600}, Level.WARN, '3 reference messages lately were no finite number'),
     ({'silent_s': 0.5}, Level.WARN, 'no plant_output for 0.5 s: is the driver running? '
      'on_timeout: hold'),
@@ -84,7 +99,7 @@ CASES: list[tuple[dict[str, Any], Level, str]] = [
      'waiting for plant_output: nobody publishes it, start the driver'),
     ({'status': None, 'used': 0}, Level.WARN,
      'waiting for plant_output: /driver is there but sends none'),
-    ({'status': None, 'used': 0, 'without_reference': 600, 'referred': False,
+    ({'status': None, 'used': 0, 'without_reference': 600, 'reference_silent_s': inf,
       'reference': reference_from()}, Level.WARN,
      'waiting for reference: nobody publishes it, start one'),
     ({'reference_silent_s': 1.0}, Level.WARN, 'no reference for more than 1 s'),
@@ -136,23 +151,23 @@ def test_each_cause_is_named_with_its_figure_and_its_cure(changes, level, text):
 def test_estimates_of_before_that_hold_are_not_said_to_move() -> None:
     acquiring = replace(WELL, status=Status.ACQUIRING)
     assert first(acquiring).kind == 'acquiring'
-    assert first(replace(acquiring, law=LawReport(unconfirmed=True))).kind == 'known'
+    assert first(replace(acquiring, report=LawReport(unconfirmed=True))).kind == 'known'
     # It is confirmed where the status says so, or asked for.
-    assert first(replace(WELL, law=LawReport(unconfirmed=True))) == LEARNED
-    assert first(replace(acquiring, law=LawReport(unconfirmed=True), adapting=False)).kind == \
+    assert first(replace(WELL, report=LawReport(unconfirmed=True))) == LEARNED
+    assert first(replace(acquiring, report=LawReport(unconfirmed=True), adapting=False)).kind == \
         'adaptation off'
 
 
 @pytest.mark.parametrize(('changes', 'text'), [
-    ({'law': LawReport(unexplained=0.234)},
+    ({'report': LawReport(unexplained=0.234)},
      '23.4 % of m*gap of the motion of u fits no G and no backlash: check G(z), load, sensor'),
-    ({'law': LawReport(coasts=True, unexplained=0.234)},
+    ({'report': LawReport(coasts=True, unexplained=0.234)},
      'the load coasts in the gap (23 % of m*gap): brake it, or move more slowly'),
-    ({'law': LawReport(wrong_sign=True, unexplained=0.3)},
+    ({'report': LawReport(wrong_sign=True, unexplained=0.3)},
      'plant_output moves against v: reverse it, or the sign of plant.numerator'),
     # What noise leaves, or what has no gap to be compared with, is no reason.
-    ({'law': LawReport(unexplained=0.01)}, BLAMED),
-    ({'law': LawReport(unexplained=inf)}, BLAMED),
+    ({'report': LawReport(unexplained=0.01)}, BLAMED),
+    ({'report': LawReport(unexplained=inf)}, BLAMED),
 ])
 def test_a_contradiction_is_named_by_what_the_fit_has_found(changes, text):
     found = first(replace(INCONSISTENT, **changes))
@@ -169,7 +184,7 @@ def test_a_contradiction_is_named_by_what_the_fit_has_found(changes, text):
      'it'),
 ])
 def test_a_bound_that_forbids_an_estimate_is_a_warning_with_what_was_found(forbidden, text):
-    figures = replace(WELL, status=Status.ACQUIRING, law=LawReport(forbidden=forbidden))
+    figures = replace(WELL, status=Status.ACQUIRING, report=LawReport(forbidden=forbidden))
     assert findings_of(figures) == [Finding(Level.WARN, 'bound', text)]
 
 
@@ -180,7 +195,7 @@ def test_the_model_is_not_blamed_where_a_tenth_of_the_commands_is_late(late, kin
 
 
 def test_what_the_fit_has_found_goes_before_what_may_be_missing() -> None:
-    for known in ({'law': LawReport(wrong_sign=True)}, {'law': LawReport(unexplained=0.2)}):
+    for known in ({'report': LawReport(wrong_sign=True)}, {'report': LawReport(unexplained=0.2)}):
         figures = replace(INCONSISTENT, unreported=30, inconsistent_s=10.0, **known)
         assert [finding.kind for finding in findings_of(figures)] == ['model', 'unreported']
 
@@ -190,7 +205,7 @@ def test_what_the_fit_has_found_goes_before_what_may_be_missing() -> None:
     {'period': Period(0.00506, 1e-7, 0.005)}, {'intervals_s': (0.02, 0.02, 0.02)},
 ])
 def test_a_wrong_sign_is_named_before_what_it_or_a_busy_machine_leads_to(changes):
-    found = findings_of(replace(INCONSISTENT, law=LawReport(wrong_sign=True), **changes))
+    found = findings_of(replace(INCONSISTENT, report=LawReport(wrong_sign=True), **changes))
     assert found[0].kind == 'model'
     assert len(found) == 2
 
