@@ -24,16 +24,12 @@ from backlash_ros.nodes import followed
 from backlash_ros.nodes.runtime.executor import PromptExecutor
 from backlash_ros.nodes.runtime.process import ENABLED, ProcessNode, emit, ros_arguments, run
 from backlash_ros.options import port
-from backlash_ros.topics import BACKLASH
+from backlash_ros.topics import WATCH_LABELS
 
 HOST = '127.0.0.1'
-SHOWN_S, PAGE_PERIOD_S = 10.0, 0.1  # width of the curves, time between two looks
-LIVE_LABELS = (
-    *BACKLASH, *(f'{name}_{end}' for name in BACKLASH for end in ('low', 'high')),
-    'y_m', 'y', 'u_d', 'v', 'u_hat',
-)
-
-Point = tuple[float, float | None]
+PAGE_PERIOD_S = 0.1  # between two looks
+LIVE_LABELS = tuple(
+    label for label in WATCH_LABELS if label not in ('gap', 'innovation', 'status', 'latency_s'))
 
 
 class PageServer(ThreadingHTTPServer):
@@ -107,16 +103,16 @@ class PageRequest(BaseHTTPRequestHandler):
 
 
 class LiveNode(ProcessNode):
-    """Shows every controller of the domain, or those of some namespaces.
+    """Shows the controllers that are wanted, as FollowedControllers knows them.
 
-    wanted: names of controllers or namespaces, none for all.
+    shown_s: width of the curves.
     """
 
-    def __init__(self, wanted: Sequence[str], server: PageServer) -> None:
+    def __init__(self, wanted: Sequence[str], server: PageServer, shown_s: float) -> None:
         super().__init__('live')
         # A machine that is held up for a second loses no point.
         self._followed = followed.FollowedControllers(self, wanted, LIVE_LABELS, depth=30)
-        self._server = server
+        self._server, self._shown_s = server, shown_s
         self._start_ns = time.time_ns()
 
     def work(self, executor: PromptExecutor) -> None:
@@ -132,7 +128,7 @@ class LiveNode(ProcessNode):
             states, now_s = self._followed.by_name, time.monotonic()
             curves = {name: self._points_of(state) for name, state in states.items()}
             self._server.add({
-                'now': self._seconds(time.time_ns()), 'shown': SHOWN_S,
+                'now': self._seconds(time.time_ns()), 'shown': self._shown_s,
                 'awaited': self._followed.awaited,
                 'controllers': [content_of(states[name], now_s) for name in sorted(states)],
             }, curves)
@@ -141,9 +137,11 @@ class LiveNode(ProcessNode):
             time.sleep(due_s - now_s)
         self._server.shutdown()
 
-    def _points_of(self, state: followed.ControllerState) -> dict[str, list[Point]]:
+    def _points_of(
+        self, state: followed.ControllerState,
+    ) -> dict[str, list[tuple[float, float | None]]]:
         """What has come of each curve: time of arrival [s] and value."""
-        points: dict[str, list[Point]] = {}
+        points: dict[str, list[tuple[float, float | None]]] = {}
         for label, at_ns, value in state.watch():
             points.setdefault(label, []).append((self._seconds(at_ns), rounded(value)))
         return points
@@ -177,13 +175,15 @@ def main(args: list[str] | None = None) -> int:
     parser.add_argument('--port', type=port, default=0, metavar='PORT',
                         help='of the page (default: a free one)')
     options = parser.parse_args(remove_ros_args(['', *arguments])[1:])
+    shown_s = 10.0
     try:
-        server = PageServer(options.port, kept=round(SHOWN_S / PAGE_PERIOD_S))
+        server = PageServer(options.port, kept=round(shown_s / PAGE_PERIOD_S))
     except OSError as error:
         parser.error(f'--port={options.port}: {error.strerror}: choose another one, or none')
     followed.give_way()
     with server:
-        return run('live', lambda: LiveNode(options.name, server), ros_arguments(arguments))
+        return run('live', lambda: LiveNode(options.name, server, shown_s),
+                   ros_arguments(arguments))
 
 
 if __name__ == '__main__':

@@ -15,7 +15,8 @@ import time
 import tty
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from math import isfinite, isnan
+from io import TextIOWrapper
+from math import floor, isfinite, isnan, log10
 from textwrap import wrap
 from typing import Any
 
@@ -32,25 +33,17 @@ from backlash_ros.nodes.runtime.process import ProcessNode, ros_arguments, run
 from backlash_ros.topics import BACKLASH
 
 SCREEN_PERIOD_S = 0.2
-ANSWER_S = 2.0  # longest wait for a service, and for its answer
 NOTICE_S = 3.0  # for which a notice is shown, and a second r resets
-
-
 # By key: the service, and the switch of the diagnostics that it turns over.
 ACTIONS = {
     'f': ('freeze_adaptation', 'learning'), 'c': ('enable_compensation', 'compensating'),
     'r': ('reset_estimates', ''), 's': ('save_estimates', ''),
 }
-
-# Sure, within the band, beyond it.
-BAR = '█▒·'
+BAR = '█▒·'  # sure, within the band, beyond it
 
 
 class MonitorNode(ProcessNode):
-    """Follows every controller of the domain, or those of some namespaces.
-
-    wanted: names of controllers or namespaces, none for all.
-    """
+    """Shows the controllers that are wanted, as FollowedControllers knows them."""
 
     def __init__(self, wanted: Sequence[str]) -> None:
         super().__init__('monitor')
@@ -60,9 +53,8 @@ class MonitorNode(ProcessNode):
         self._confirmed_until_s = 0.0  # a second r resets
 
     def work(self, executor: PromptExecutor) -> None:
-        # Whatever a terminal cannot show must not end this.
-        if hasattr(sys.stdout, 'reconfigure'):
-            sys.stdout.reconfigure(errors='replace')
+        if isinstance(sys.stdout, TextIOWrapper):
+            sys.stdout.reconfigure(errors='replace')  # whatever a terminal cannot show
         console = Console()
         with suppress(BrokenPipeError):
             if console.is_terminal and not console.is_dumb_terminal:
@@ -137,14 +129,13 @@ class MonitorNode(ProcessNode):
         if switch:
             request = SetBool.Request(data=on if service == 'enable_compensation' else not on)
         client = self.create_client(SetBool if switch else Trigger, name)
-        text = f'{name} is not there'
-        if client.wait_for_service(ANSWER_S):
-            text, until_s = f'no answer within {ANSWER_S:g} s', time.monotonic() + ANSWER_S
+        text, patience_s = f'{name} is not there', 2.0
+        if client.wait_for_service(patience_s):
+            text, until_s = f'no answer within {patience_s:g} s', time.monotonic() + patience_s
             answer = client.call_async(request)
             while not (answer.done() or self.stopping or time.monotonic() > until_s):
                 executor.spin_once(timeout_sec=SCREEN_PERIOD_S / 4)
-            if answer.done():
-                response = answer.result()
+            if answer.done() and (response := answer.result()):
                 text = response.message
                 if switch and response.success:
                     state.values[switch] = str(on)  # the next diagnostics may be a second away
@@ -175,11 +166,10 @@ def bar(value: float, half_width: float, scale: float, width: int, blocks: str =
 
 def axis_end(largest: float) -> float:
     """The next of 1, 2, 5, 10, 20, ... above 1.1 times the largest magnitude; 0 without one."""
-    wanted = 1.1 * largest
-    if not wanted > 0.0:
+    if not largest > 0.0:
         return 0.0
-    power = 10.0 ** int(f'{wanted:e}'.partition('e')[2])
-    return next(step * power for step in (1.0, 2.0, 5.0, 10.0) if step * power >= wanted)
+    power = 10.0 ** floor(log10(1.1 * largest))
+    return next(step * power for step in (1.0, 2.0, 5.0, 10.0) if step * power >= 1.1 * largest)
 
 
 def screen(
@@ -210,16 +200,15 @@ def screen(
 
 
 def plain_line(state: followed.ControllerState, now_s: float) -> str:
-    parts = [f'{state.name}: {state.word(now_s)}', ', '.join(
-        f'{name} {_with_band(state, name)}' for name in BACKLASH
-        if isfinite(state.estimates[name][0])
-    )]
-    if 'samples' in state.values:
-        parts.append(
-            f'excitation {state.excitation:.3g}, '
-            f'latency {state.number("latency p50 [ms]"):.3g} ms, lost {state.values.get("lost")}'
-        )
-    return '; '.join(part for part in parts if part)
+    known = [name for name in BACKLASH if isfinite(state.estimates[name][0])]
+    figures = (
+        f'excitation {state.excitation:.3g}, latency {state.number("latency p50 [ms]"):.3g} ms, '
+        f'lost {state.values.get("lost")}' if 'samples' in state.values else ''
+    )
+    return '; '.join(filter(None, [
+        f'{state.name}: {state.word(now_s)}',
+        ', '.join(f'{name} {_with_band(state, name)}' for name in known), figures,
+    ]))
 
 
 def _panel(
