@@ -11,7 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from rosbags.interfaces import Connection
-from rosbags.rosbag2 import Writer, WriterError
+from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
 from backlash_ros.bags.reader import (
@@ -22,7 +22,7 @@ from backlash_ros.bags.reader import (
     NoBagError,
     Topic,
 )
-from backlash_ros.bags.writer import STORAGE, lock_folder, sync_path
+from backlash_ros.bags.writer import lock_folder, sync_path
 from backlash_ros.options import BAD_INPUT, DONE, FAILED
 
 
@@ -80,7 +80,7 @@ def _rewrite(reader: BagReader, why: str) -> list[str]:
     messages: Counter[str] = Counter()
     first, last = 2**63, 0
     connections: dict[Topic, Connection] = {}
-    storage = STORAGE[STORAGE_OF_SUFFIX[reader.files[0].suffix]]
+    storage = StoragePlugin[STORAGE_OF_SUFFIX[reader.files[0].suffix].upper()]
     with TemporaryDirectory(dir=bag.parent, prefix=f'{bag.name}.') as folder:
         # The name of a bag is that of its file as well.
         repaired = Path(folder) / bag.name

@@ -17,8 +17,6 @@ from rosbags.typesys import Stores, get_typestore
 
 from backlash_ros.core.parameters.errors import ParameterError
 
-STORAGE = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
-
 
 class RecordingError(RuntimeError):
     """The bag cannot take any more: the message is the reason in a few words."""
@@ -27,7 +25,7 @@ class RecordingError(RuntimeError):
 class Bag:
     """An open bag. After a RecordingError it is closed, and holds what was flushed before.
 
-    path: folder, must not exist. storage: a key of STORAGE. Raises ParameterError.
+    path: folder, must not exist. storage: mcap or sqlite3. Raises ParameterError.
     saved: messages that a crash leaves. saved_ns: the time from the first to the last of them.
     survives_a_crash: whether flush() works with the version of rosbags that is installed.
     """
@@ -40,7 +38,7 @@ class Bag:
         self.survives_a_crash = True
         if self.path.exists():
             raise ParameterError('bag', path, 'exists already', 'name a new folder')
-        self._writer = Writer(self.path, version=9, storage_plugin=STORAGE[storage])
+        self._writer = Writer(self.path, version=9, storage_plugin=StoragePlugin[storage.upper()])
         try:
             with self._closed_on_error():
                 self._writer.open()

@@ -15,9 +15,6 @@ from collections.abc import MutableMapping
 from pathlib import Path
 
 PROFILE = Path(__file__).with_suffix('.xml')
-NETWORK_PROFILE = PROFILE.with_stem('network')
-VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
-OF_THE_FOLDER = 'DEFAULT_FASTRTPS_PROFILES.xml'  # read by Fast DDS from the working directory
 
 
 def prefer_loopback(environment: MutableMapping[str, str]) -> None:
@@ -26,6 +23,8 @@ def prefer_loopback(environment: MutableMapping[str, str]) -> None:
     A profile of the user's own stays in force.
     """
     confined = environment.get('ROS_AUTOMATIC_DISCOVERY_RANGE') == 'LOCALHOST'
-    if confined and not Path(OF_THE_FOLDER).exists():
+    # Fast DDS reads this one from the working directory.
+    if confined and not Path('DEFAULT_FASTRTPS_PROFILES.xml').exists():
         alone = not environment.get('ROS_STATIC_PEERS')
-        environment.setdefault(VARIABLE, str(PROFILE if alone else NETWORK_PROFILE))
+        environment.setdefault('FASTRTPS_DEFAULT_PROFILES_FILE',
+                               str(PROFILE if alone else PROFILE.with_stem('network')))

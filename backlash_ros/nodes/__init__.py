@@ -7,15 +7,15 @@ from types import FrameType
 
 from backlash_ros.middleware.installed import ROS_MISSING, ros_is_missing
 
-EXECUTABLES = ('controller', 'plant', 'reference', 'recorder', 'check_driver', 'monitor', 'live')
-
 
 def _end(number: int, frame: FrameType | None) -> None:
     os._exit(0)
 
 
 # With -m, sys.argv[0] is '-m' until the module is found; else it is the installed script.
-if sys.argv and (sys.argv[0] == '-m' or os.path.basename(sys.argv[0]) in EXECUTABLES):
+if sys.argv and os.path.basename(sys.argv[0]) in (
+    '-m', 'controller', 'plant', 'reference', 'recorder', 'check_driver', 'monitor', 'live',
+):
     for _number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(_number, _end)
     # Whoever starts a node may hold them back until here, where they end it well.

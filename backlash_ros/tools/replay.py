@@ -33,9 +33,6 @@ from backlash_ros.tools.runs.files import Run, result_directory, write_table
 from backlash_ros.tools.runs.read_run import find_bag
 from backlash_ros.topics import BACKLASH
 
-HEADER = ('run', 'changed', 'm', 'c_r', 'c_l', 'std_m', 'std_c_r', 'std_c_l', 'tracking from [s]',
-          'innovation RMS')
-
 
 @dataclass(frozen=True)
 class Source:
@@ -82,14 +79,16 @@ def _replay(args: Sequence[str] | None) -> None:
         _one(sources[0], options.out)
         return
     rows = []
+    header = ('run', 'changed', *BACKLASH, *(f'std_{name}' for name in BACKLASH),
+              'tracking from [s]', 'innovation RMS')
     for source in sources:
         for change in changes:
             words = ' '.join(f'{name}={as_yaml(value)}' for name, value in change.items())
             run = source.replayed(source.parameters.replaced(change), f'{source.path.name} {words}')
             rows.append(((str(source.path), words), _numbers(run)))
     path = result_directory(options.out) / 'replays.csv'
-    write_table(path, HEADER, [(*names, *values) for names, values in rows])
-    print(cli.format_table(HEADER, [(*names, *map(cli.number, values)) for names, values in rows]))
+    write_table(path, header, [(*names, *values) for names, values in rows])
+    print(cli.format_table(header, [(*names, *map(cli.number, values)) for names, values in rows]))
     print(path)
 
 
@@ -161,11 +160,11 @@ def _parted(recorded: RunRecord, replayed: RunRecord) -> str:
 
 
 def _numbers(run: RunRecord) -> tuple[float, ...]:
-    """What a table has of a replay, as HEADER names it."""
+    """What a table has of a replay behind its name and changes."""
     tracking = run.column('t')[run.column('status') == Status.TRACKING]
     innovation = run.column('innovation')[run.samples // 2:]
     known = innovation[np.isfinite(innovation)]
-    return (*(float(run.column(name)[-1]) for name in HEADER[2:8]),
+    return (*(float(run.column(f'{std}{name}')[-1]) for std in ('', 'std_') for name in BACKLASH),
             float(tracking[0]) if len(tracking) else nan,
             float(np.sqrt(np.mean(known**2))) if len(known) else nan)
 

@@ -4,24 +4,18 @@ from pathlib import Path
 
 import pytest
 
-from backlash_ros.middleware.loopback import (
-    NETWORK_PROFILE,
-    OF_THE_FOLDER,
-    PROFILE,
-    VARIABLE,
-    prefer_loopback,
-)
+from backlash_ros.middleware.loopback import PROFILE, prefer_loopback
 
 HERE = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
 
 
 def chosen(environment: dict[str, str]) -> str | None:
     prefer_loopback(environment)
-    return environment.get(VARIABLE)
+    return environment.get('FASTRTPS_DEFAULT_PROFILES_FILE')
 
 
 @pytest.mark.parametrize(('environment', 'profile'), [
-    (HERE, PROFILE), ({**HERE, 'ROS_STATIC_PEERS': '192.168.0.2'}, NETWORK_PROFILE),
+    (HERE, PROFILE), ({**HERE, 'ROS_STATIC_PEERS': '192.168.0.2'}, PROFILE.with_stem('network')),
     ({}, None), ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}, None),
 ])
 def test_a_profile_follows_from_who_is_to_be_met(environment, profile) -> None:
@@ -30,7 +24,7 @@ def test_a_profile_follows_from_who_is_to_be_met(environment, profile) -> None:
 
 
 def test_a_profile_of_the_user_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert chosen({**HERE, VARIABLE: 'own.xml'}) == 'own.xml'
+    assert chosen({**HERE, 'FASTRTPS_DEFAULT_PROFILES_FILE': 'own.xml'}) == 'own.xml'
     monkeypatch.chdir(tmp_path)
-    (tmp_path / OF_THE_FOLDER).touch()
+    (tmp_path / 'DEFAULT_FASTRTPS_PROFILES.xml').touch()
     assert chosen({**HERE}) is None
