@@ -71,11 +71,6 @@ class TopicFigures(NamedTuple):
         """Those whose messages pass."""
         return [peer for peer in self.peers if not peer.unfit]
 
-    @property
-    def all_fit(self) -> bool:
-        """Whether there is nobody whose messages do not pass."""
-        return not any(peer.unfit for peer in self.peers)
-
     def waiting(self, start: str) -> str:
         """Why nothing comes; start: what to do where nobody publishes it."""
         why = f'{self.heard[0]} is there but sends none' if self.heard \
@@ -244,6 +239,10 @@ def causes_of(f: LoopFigures) -> tuple[Row, ...]:
     begins = status is None and f.silent_s == 0.0
     runs = status is not None and f.silent_s == 0.0
     late_ms, clocks = f'{1e3 * abs(age_s):.3g} ms', 'set both clocks (chrony, PTP)'
+
+    def fits(topic: TopicFigures) -> bool:
+        return len(topic.heard) == len(topic.peers)
+
     return (
         *_unheard(f.around),
         # What comes is of no use.
@@ -266,10 +265,10 @@ def causes_of(f: LoopFigures) -> tuple[Row, ...]:
         # What does not come.
         ('silent', warn, f.silent_s > 0.0,
          f'no {y} for {f.silent_s:g} s: is the driver running? on_timeout: {f.on_timeout}'),
-        ('waiting for output', warn, begins and f.heard == 0 and y.all_fit,
+        ('waiting for output', warn, begins and f.heard == 0 and fits(y),
          y.waiting('start the driver')),
         ('waiting for reference', warn,
-         begins and f.reference_silent_s == inf and f.bad_references == 0 and y_m.all_fit,
+         begins and f.reference_silent_s == inf and f.bad_references == 0 and fits(y_m),
          y_m.waiting('start one')),
         ('unheard', warn, runs and not v.peers,
          f'nobody listens to {v}: is it the name that the driver uses?'),

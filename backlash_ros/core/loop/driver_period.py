@@ -142,17 +142,14 @@ class DriverPeriod:
         times = 1e-9 * np.array([stamp - stamps[-1] for stamp in stamps])
         # Those of 2 s, 20 intervals at least.
         times = times[min(int(np.count_nonzero(times < -2.0)), len(times) - 21):]
-        steps, nominal_s = np.diff(times), self.nominal_s
-        ordered, quarter = np.sort(steps), len(steps) // 4
+        ordered, nominal_s = np.sort(np.diff(times)), self.nominal_s
+        quarter = len(ordered) // 4
         typical = float(ordered[quarter:-quarter].mean())
         if not abs(typical / nominal_s - 1.0) < 0.25:
             return Period()
-        found = _slope(np.append(0.0, np.cumsum(np.round(steps / nominal_s))), times, 1)
-        if found.mean > 0.0:
-            # Neighbours tell the same.
-            apart = 1 + len(times) // 300
-            times = times[::apart]
-            found = _slope(np.array(_numbered(times.tolist(), found.mean)), times, apart)
+        apart = 1 + len(times) // 300  # neighbours tell the same
+        times = times[::apart]
+        found = _slope(np.array(_numbered(times.tolist(), typical)), times, apart)
         # Beyond such a scatter, as of a driver that is held up all the time, nobody can tell from
         # the stamps which samples were left out.
         if not (found.mean > 0.0 and found.scatter < 0.2 * nominal_s):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import cache
 from math import isfinite
 from pathlib import Path
 
@@ -59,16 +60,15 @@ class Joint:
     @property
     def driver(self) -> Driver:
         """What its loop can ask about the driver; the simulated plant has nothing to be asked."""
-        io, warned = self._io, set[str]()
+        io = self._io
 
+        @cache
         def warn_once(text: str) -> None:
-            if text not in warned and not io.is_simulated:
+            if not io.is_simulated:
                 self._node.log.warning(f'{self.name}: {text}' if self.name else text)
-            warned.add(text)
 
         return Driver(
-            io.now_ns, lambda: io.has_reports and not io.is_simulated, io.topics.applied,
-            warn_once,
+            io.now_ns, lambda: io.has_reports and not io.is_simulated, io.topics.applied, warn_once
         )
 
     def begin(self, loop: ControlLoop, before: Estimate) -> None:

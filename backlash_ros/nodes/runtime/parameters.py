@@ -6,7 +6,6 @@ import difflib
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import pairwise
-from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -127,20 +126,13 @@ def let_parameters_change(
 
 def _description(entry: Parameter, name: str, reconfigurable: bool) -> msg.ParameterDescriptor:
     """What tools like rqt and `ros2 param describe` show."""
-    descriptor = msg.ParameterDescriptor(
+    return msg.ParameterDescriptor(
         name=name, type=_ros_parameter(name, entry.default, entry).type_.value,
         description=entry.description + (f' [{entry.unit}]' if entry.unit else ''),
         additional_constraints='one of ' + ', '.join(entry.choices) if entry.choices
         else entry.rules,
         read_only=entry.change not in ('live', *['unconfigured'] * reconfigurable),
     )
-    bounds = {'from_value': entry.low, 'to_value': entry.high}
-    if isinstance(entry.default, float) and isfinite(entry.high - entry.low):
-        descriptor.floating_point_range = [msg.FloatingPointRange(**bounds)]
-    elif isfinite(entry.high - entry.low) and isinstance(entry.default, int):
-        whole = {end: int(value) for end, value in bounds.items()}
-        descriptor.integer_range = [msg.IntegerRange(**whole, step=1)]
-    return descriptor
 
 
 def _given_value(parameter: RosParameter) -> object:
