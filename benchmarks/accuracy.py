@@ -18,11 +18,10 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 # Before numpy is imported: the matrices are tiny, threads would only disturb the processes.
 os.environ.setdefault('OMP_NUM_THREADS', '1')
@@ -35,7 +34,7 @@ from contract import following_rows as following
 from contract import learning_rows as learning
 from contract import situation_rows as situation
 from contract import timing_rows as timing
-from contract.figures import COMPARED_HEADER, Row, as_json, compare, from_json, show
+from contract.figures import COMPARED_HEADER, Figure, Row, as_json, compare, show
 from reporting import ROOT, machine, markdown_table, text_table
 from tqdm import tqdm
 
@@ -45,8 +44,7 @@ RESULT = ROOT / 'results' / 'accuracy.json'
 WORKERS, NICENESS = 2, 5
 
 
-@dataclass(frozen=True)
-class Measured:
+class Measured(NamedTuple):
     """How a row is measured: its jobs for a scale, what each does, the figures of all results.
 
     alone: in this process, with nothing beside it, because it is about time.
@@ -59,19 +57,17 @@ class Measured:
 
 
 ROWS: dict[str, Measured] = {
-    'step': Measured(timing.step_jobs, timing.run_step, timing.times_figures, alone=True),
-    'latency': Measured(timing.latency_jobs, timing.run_latency, timing.times_figures, alone=True),
-    'simulate': Measured(
-        timing.simulate_jobs, timing.run_simulate, timing.times_figures, alone=True),
-    'identify': Measured(
-        timing.identify_jobs, timing.run_identify, timing.times_figures, alone=True),
+    **{name: Measured(jobs, run, timing.times_figures, alone=True) for name, jobs, run in (
+        ('step', timing.step_jobs, timing.run_step),
+        ('latency', timing.latency_jobs, timing.run_latency),
+        ('simulate', timing.simulate_jobs, timing.run_simulate),
+        ('identify', timing.identify_jobs, timing.run_identify))},
     'bound': Measured(learning.bound_jobs, learning.run_job, learning.bound_figures),
     'losses': Measured(learning.losses_jobs, learning.run_job, learning.bound_figures),
     'random': Measured(learning.random_jobs, learning.run_random, learning.random_figures),
-    'plants, open loop': Measured(
-        partial(learning.plants_jobs, 'proportional'), learning.run_job, learning.plants_figures),
-    'plants, closed loop': Measured(
-        partial(learning.plants_jobs, 'tracking'), learning.run_job, learning.plants_figures),
+    **{f'plants, {loop} loop': Measured(
+        partial(learning.plants_jobs, structure), learning.run_job, learning.plants_figures)
+       for loop, structure in (('open', 'proportional'), ('closed', 'tracking'))},
     'changes': Measured(learning.changes_jobs, learning.run_job, learning.changes_figures),
     'following': Measured(
         following.following_jobs, following.run_following, following.following_figures),
@@ -134,9 +130,8 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument('--compare', type=Path, default=REFERENCE, metavar='FILE',
                         help='another reference')
     arguments = parser.parse_args()
-    for name in arguments.only:
-        if name not in ROWS:
-            parser.error(f'--only {name!r} must be of: {"; ".join(ROWS)}')
+    if unknown := [name for name in arguments.only if name not in ROWS]:
+        parser.error(f'--only {unknown[0]!r} must be of: {"; ".join(ROWS)}')
     if not (arguments.scale > 0.0 and arguments.workers > 0):
         parser.error('--scale and --workers must be > 0')
     return arguments
@@ -144,7 +139,9 @@ def parse_arguments() -> argparse.Namespace:
 
 def read_rows(path: Path) -> dict[str, Row]:
     """Rows of a file of results; none where there is no file."""
-    return from_json(json.loads(path.read_text())['rows']) if path.exists() else {}
+    rows = json.loads(path.read_text())['rows'] if path.exists() else {}
+    return {name: {what: Figure(**values) for what, values in row.items()}
+            for name, row in rows.items()}
 
 
 def write_rows(path: Path, rows: dict[str, Row]) -> None:
@@ -166,8 +163,9 @@ predict + update of a Kalman filter with six states, those over DDS in units of 
 What each row is: [accuracy.py](../../benchmarks/accuracy.py)."""
 
 
-def write_page() -> None:
-    """Write the reference as Markdown."""
+def adopt(rows: dict[str, Row]) -> None:
+    """Let these rows be the reference, and write it as Markdown."""
+    write_rows(REFERENCE, rows)
     sections = [
         f'## {name.capitalize()}\n\n' + markdown_table(
             ('figure', 'value', 'runs'),
@@ -175,12 +173,6 @@ def write_page() -> None:
         for name, row in read_rows(REFERENCE).items()
     ]
     PAGE.write_text('\n\n'.join([HEAD, *sections]) + '\n')
-
-
-def adopt(rows: dict[str, Row]) -> None:
-    """Let these rows be the reference."""
-    write_rows(REFERENCE, rows)
-    write_page()
     print(f'wrote {", ".join(rows)} into {REFERENCE.relative_to(ROOT)}')
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
 from math import ceil
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,13 +29,11 @@ DRAWS = 10  # two for every pole of a plant
 NEAR_ONE = 1e-6  # distance of a pole from 1 that makes it an integrator
 
 
-@dataclass(frozen=True)
-class Case:
-    """One random case: what the package is given, and how long it may take."""
+class Case(NamedTuple):
+    """One random case: what the package is given, and three periods of the reference."""
 
-    seed: int
     parameters: Parameters
-    samples: int  # three periods of the reference
+    samples: int
     kind: str
 
 
@@ -71,8 +69,7 @@ def random_case(seed: int, **fixed: object) -> Case:
     Cramér-Rao bound of the loop that knows the backlash is beyond 0.4 % for m, c_r or c_l after the
     three periods, as for a small c_r beside a large c_l. No estimator has a part in that.
     """
-    case, samples_per_period = _without_noise(seed)
-    return _with_noise(case, _noise(case.parameters, samples_per_period, TOLD), fixed)
+    return _with_noise(_without_noise(seed), TOLD, fixed)
 
 
 def uncertain_case(seed: int) -> Case:
@@ -80,33 +77,24 @@ def uncertain_case(seed: int) -> Case:
 
     The reference is slower than every pole, omega tau <= 1: to a faster one a time constant is a
     gain, which y does not tell from m. The bound that limits the noise is 0.6 %, for time constants
-    and damping that are known as well as they are spread.
+    and damping that are known as well as they are spread. Every time constant is off by SPREAD, the
+    damping as it was.
     """
-    case, samples_per_period = _without_noise(seed, below_corners=True)
+    case = _without_noise(seed, below_corners=True)
     p = case.parameters
+    signs = np.random.default_rng([seed, 21]).choice([-1.0, 1.0], DRAWS // 2)
+    off = np.column_stack([signs * np.log1p(SPREAD), np.zeros(DRAWS // 2)]).ravel()
     numerator, denominator = altered(
-        np.array(p.plant.numerator), np.array(p.plant.denominator),
-        _off(np.random.default_rng([seed, 21])),
-    )
+        np.array(p.plant.numerator), np.array(p.plant.denominator), off)
     p = p.replaced({
         'truth.numerator': numerator.tolist(), 'truth.denominator': denominator.tolist(),
         'plant.uncertainty': UNCERTAINTY,
     })
-    case = replace(case, parameters=p)
-    return _with_noise(case, _noise(p, samples_per_period, TOLD_UNCERTAIN), {})
+    return _with_noise(case._replace(parameters=p), TOLD_UNCERTAIN, {})
 
 
-def _off(rng: np.random.Generator) -> Array:
-    """Logarithms for `altered`: every time constant off by SPREAD, the damping as it was."""
-    signs = rng.choice([-1.0, 1.0], DRAWS // 2)
-    return np.column_stack([signs * np.log1p(SPREAD), np.zeros(DRAWS // 2)]).ravel()
-
-
-def _without_noise(seed: int, below_corners: bool = False) -> tuple[Case, int]:
-    """The case, and the samples of a period.
-
-    below_corners: whether the reference is no faster than the slowest pole.
-    """
+def _without_noise(seed: int, below_corners: bool = False) -> Case:
+    """below_corners: whether the reference is no faster than the slowest pole."""
     rng = np.random.default_rng([seed, 20])
     numerator, denominator, kind = random_plant(rng)
     m = float(np.exp(rng.uniform(np.log(0.3), np.log(3.0))))
@@ -135,8 +123,7 @@ def _without_noise(seed: int, below_corners: bool = False) -> tuple[Case, int]:
         'waveform': waveform, 'amplitude': amplitude, 'frequency': float(omega),
         'sample_period': period, 'seed': seed, 'plant.uncertainty': 0.0,
     })
-    samples = PERIODS * samples_per_period
-    return Case(seed, parameters, samples, f'{kind} {waveform}'), samples_per_period
+    return Case(parameters, PERIODS * samples_per_period, f'{kind} {waveform}')
 
 
 def _slowest(denominator: Array) -> float:
@@ -145,9 +132,10 @@ def _slowest(denominator: Array) -> float:
     return float(-1.0 / np.log(max(sizes))) if sizes else 0.0
 
 
-def _with_noise(case: Case, noise: float, fixed: Mapping[str, object]) -> Case:
+def _with_noise(case: Case, told: float, fixed: Mapping[str, object]) -> Case:
+    noise = _noise(case, told)
     changes = {'output_noise_std': noise, 'estimator.output_noise_std': noise, **fixed}
-    return replace(case, parameters=case.parameters.replaced(changes))
+    return case._replace(parameters=case.parameters.replaced(changes))
 
 
 def altered(numerator: Array, denominator: Array, logs: Array) -> tuple[Array, Array]:
@@ -190,12 +178,7 @@ def bound_of(p: Parameters, v: Array) -> Array:
         return np.asarray((there - back).T / (2.0 * STEP))
 
     bound = cramer_rao(
-        v,
-        numerator,
-        denominator,
-        truth,
-        p.output_noise_std,
-        u0=p.backlash.initial_u,
+        v, numerator, denominator, truth, p.output_noise_std, u0=p.backlash.initial_u,
         effects=effects if p.plant.uncertainty else None,
     )
     return np.asarray(bound / np.abs(truth))
@@ -206,17 +189,18 @@ def _response(numerator: Array, denominator: Array, u: Array) -> Array:
     return np.asarray(lfilter(delayed, denominator, u))
 
 
-def _noise(p: Parameters, samples_per_period: int, told: float) -> float:
+def _noise(case: Case, told: float) -> float:
     """Deviation of the noise on y, from the loop that knows the backlash, without noise.
 
     told: bound that the noise may lead to.
     """
+    p = case.parameters
     known = p.replaced({
         'estimator.law': 'fixed', 'plant.uncertainty': 0.0,
         **{f'estimator.initial.{name}': p[f'backlash.{name}'] for name in ('m', 'c_r', 'c_l')},
     })
-    run = build_closed_loop(known).run(PERIODS * samples_per_period + 1)
-    noise = NOISE_TO_SWING * float(np.ptp(run.column('y')[-samples_per_period:]))
+    run = build_closed_loop(known).run(case.samples + 1)
+    noise = NOISE_TO_SWING * float(np.ptp(run.column('y')[-(case.samples // PERIODS):]))
     # With less noise the bound falls, but no faster: what was known before counts less.
     for _ in range(ITERATIONS):
         bound = float(bound_of(p.replaced({'output_noise_std': noise}), run.column('v')[:-1]).max())

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from math import sqrt
+from dataclasses import asdict, dataclass
+from math import hypot, log, sqrt
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -30,23 +30,19 @@ class Figure:
     runs: int
     better: Better = 'less'
 
-    @property
-    def badness(self) -> float:
-        """Less is better."""
-        if self.better == 'one':
-            return abs(float(np.log(max(self.value, 1e-9))))
-        return self.value if self.better == 'less' else -self.value
-
-    @property
-    def badness_scatter(self) -> float:
-        """Standard deviation of that."""
-        return self.scatter / max(self.value, 1e-9) if self.better == 'one' else self.scatter
-
     def beyond(self, reference: Figure) -> float:
         """By how many standard deviations it is worse, negative where it is better."""
-        scatter = sqrt(self.badness_scatter**2 + reference.badness_scatter**2)
-        difference = self.badness - reference.badness
-        return difference / max(scatter, 1e-12) if difference else 0.0
+        (bad, scatter), (bad_before, scatter_before) = map(_badness, (self, reference))
+        difference = bad - bad_before
+        return difference / max(hypot(scatter, scatter_before), 1e-12) if difference else 0.0
+
+
+def _badness(one: Figure) -> tuple[float, float]:
+    """What is better where it is less, and its standard deviation."""
+    if one.better == 'one':
+        value = max(one.value, 1e-9)
+        return abs(log(value)), one.scatter / value
+    return one.value if one.better == 'less' else -one.value, one.scatter
 
 
 def rms(values: Array) -> float:
@@ -108,21 +104,10 @@ def by_group(
 
 def as_json(rows: Mapping[str, Row]) -> dict[str, dict[str, dict[str, Any]]]:
     """Rounded, for a file."""
-    return {
-        name: {
-            what: {'value': float(f'{one.value:.5g}'), 'scatter': float(f'{one.scatter:.3g}'),
-                   'runs': one.runs, 'better': one.better}
-            for what, one in row.items()
-        } for name, row in rows.items()
-    }
-
-
-def from_json(rows: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> dict[str, Row]:
-    """What stands in a file."""
-    return {
-        name: {what: Figure(**values) for what, values in row.items()}
-        for name, row in rows.items()
-    }
+    return {name: {
+        what: {**asdict(one), 'value': float(f'{one.value:.5g}'),
+               'scatter': float(f'{one.scatter:.3g}')} for what, one in row.items()
+    } for name, row in rows.items()}
 
 
 COMPARED_HEADER = ('row', 'figure', 'reference', 'now', 'deviations')
@@ -142,11 +127,9 @@ def compare(
             now = row.get(what)
             if now is None or (before.runs and not now.runs):
                 worse.append([name, what, show(before), 'not there', '–'])
-                continue
-            by = now.beyond(before)
-            if abs(by) > BEYOND:
-                found = worse if by > 0.0 else better
-                found.append([name, what, show(before), show(now), f'{abs(by):.1f}'])
+            elif abs(by := now.beyond(before)) > BEYOND:
+                (worse if by > 0.0 else better).append(
+                    [name, what, show(before), show(now), f'{abs(by):.1f}'])
     return worse, better
 
 
