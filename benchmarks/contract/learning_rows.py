@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from cases.coasting_load import CoastingLoad
 from cases.cramer_rao import cramer_rao
 from cases.geared_motor import motor, random_backlash
-from cases.random_cases import Case, bound_of, random_case, uncertain_case
+from cases.random_cases import bound_of, random_case, uncertain_case
 from numpy.typing import NDArray
 
 from backlash_ros.core import Parameters, Status, build_closed_loop, build_plant
@@ -205,11 +205,10 @@ def plants_figures(outcomes: Sequence[Outcome]) -> dict[str, Figure]:
 RANDOM_KINDS = ('exact', 'next to no noise', 'time constants 10 % off')
 
 
-@dataclass(frozen=True)
-class RandomOutcome:
+class RandomOutcome(NamedTuple):
     """Largest error of m, c_r, c_l over its bound and relative, at the end; judged as others."""
 
-    kind: str
+    group: str
     over_bound: float
     relative: float
     judged: Judged | None
@@ -225,7 +224,7 @@ def random_jobs(scale: float) -> list[tuple[str, int]]:
 def run_random(job: tuple[str, int]) -> RandomOutcome:
     """One random case."""
     kind, seed = job
-    case: Case = random_case(seed) if kind != RANDOM_KINDS[2] else uncertain_case(seed)
+    case = random_case(seed) if kind != RANDOM_KINDS[2] else uncertain_case(seed)
     p = case.parameters
     if kind == RANDOM_KINDS[1]:
         noise = 1e-4 * p.output_noise_std
@@ -249,7 +248,7 @@ def random_figures(outcomes: Sequence[RandomOutcome]) -> dict[str, Figure]:
         'error / bound, median': figure([r.over_bound for r in of]),
         'beyond 3 % of error': share([r.relative > 0.03 for r in of]),
         **figures_of([r.judged for r in of], ()),
-    }, lambda one: one.kind)
+    })
 
 
 # Backlashes that change, physics that is none of the model, rest.

@@ -7,7 +7,6 @@ import io
 import json
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,13 +14,14 @@ import numpy as np
 import yaml
 from cases.geared_motor import flat, motor
 from cases.held_up import HeldUpProcesses
-from cases.identification_cases import NO_PLAYS, random_case, without_play
+from cases.identification_cases import NO_PLAYS, Case, random_case, without_play
 from faults import Result
 from gears.gear_runs import (
     PRESETS,
     Gear,
     close_loop,
     gear_of,
+    limits_of,
     lost_motion,
     quasi_static,
     record,
@@ -30,6 +30,7 @@ from gears.gear_runs import (
 from numpy.typing import NDArray
 
 from backlash_ros.core import Estimate, Parameters, Status, build_controller, fit_record
+from backlash_ros.core.plant.transfer_function import TransferFunction
 from backlash_ros.tools.identify.command import main as identify
 from contract.figures import Figure, by_group, figure, share, upper
 
@@ -101,9 +102,8 @@ def faults_figures(results: Sequence[Result]) -> dict[str, Figure]:
 # Identification.
 
 
-@dataclass(frozen=True)
-class Found:
-    """What `identify` found. files: identified.json, and parameters of identified.yaml."""
+class Found(NamedTuple):
+    """What `identify` found: identified.json, and parameters of identified.yaml."""
 
     json: Mapping[str, Any]
     parameters: Parameters | None
@@ -113,17 +113,6 @@ class Found:
         """Whether it called the result of use."""
         return bool(self.json.get('usable', False))
 
-    @property
-    def estimate(self) -> Estimate:
-        """What a controller begins with."""
-        assert self.parameters is not None
-        p, std = self.parameters, self.json['std']
-        return Estimate(
-            p.estimator.initial.m, p.estimator.initial.c_r,
-            p.estimator.initial.c_l, p.proportional.f,
-            *(max(std[name], 1e-6 * abs(self.json['gap'])) for name in ('m', 'c_r', 'c_l')),
-        )
-
 
 def identified(t: Array, v: Array, y: Array, given: Mapping[str, Any] | None = None) -> Found:
     """Let `identify` read a CSV. given: parameters that it goes on from."""
@@ -131,7 +120,7 @@ def identified(t: Array, v: Array, y: Array, given: Mapping[str, Any] | None = N
         folder = Path(name)
         np.savetxt(folder / 'record.csv', np.column_stack([t, v, y]), '%.12g', ',',
                    header='t,v,y', comments='')
-        arguments = [str(folder / 'record.csv'), '--out', str(folder / 'out')]
+        arguments = [str(folder / 'record.csv'), '--out', name]
         if given is not None:
             text = yaml.safe_dump({'/**': {'ros__parameters': given}})
             (folder / 'given.yaml').write_text(text)
@@ -139,13 +128,12 @@ def identified(t: Array, v: Array, y: Array, given: Mapping[str, Any] | None = N
         said = io.StringIO()
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
             identify(arguments)
-        out = folder / 'out'
-        if not (out / 'identified.json').exists():
+        if not (folder / 'identified.json').exists():
             return Found({'usable': False}, None)
-        found = json.loads((out / 'identified.json').read_text())
-        yaml_file = out / 'identified.yaml'
-        values = flat(yaml.safe_load(yaml_file.read_text())) if yaml_file.exists() else None
-    return Found(found, None if values is None else Parameters(values))
+        found, of_yaml = json.loads((folder / 'identified.json').read_text()), None
+        if (folder / 'identified.yaml').exists():
+            of_yaml = Parameters(flat(yaml.safe_load((folder / 'identified.yaml').read_text())))
+    return Found(found, of_yaml)
 
 
 class Identified(NamedTuple):
@@ -209,8 +197,7 @@ def _off(found: Any, true: float) -> float:
     return abs(found - true) if isinstance(found, float) else 1e3
 
 
-def _fitted(case: Any) -> tuple[float, float]:
-    from backlash_ros.core.plant.transfer_function import TransferFunction
+def _fitted(case: Case) -> tuple[float, float]:
     model = TransferFunction((case.numerator / case.m).tolist(), case.denominator.tolist())
     fit = fit_record(case.v, case.y, model, 0.02, case.level, delays=(case.delay,))
     off = abs(fit.gap - case.gap)
@@ -275,37 +262,33 @@ def run_gear(job: str | tuple[float, float]) -> list[GearOutcome]:
     else:
         gear, group, motions = gear_of(*job), 'map', MOTIONS[:1]
         lost = gear.lost_motion
-    found = _identified_gear(gear)
+    v, _, y = record(gear)
+    found = identified(gear.sample_period * np.arange(len(v)), v, y, {
+        **limits_of(gear), 'estimator.use_applied_control': 'false'})
     return [_closed(gear, group, motion, found, lost) for motion in motions]
 
 
 def _closed(gear: Gear, group: str, motion: str, found: Found, lost: float) -> GearOutcome:
-    off = abs(float(found.json.get('gap') or 0.0) / lost - 1.0)
-    if found.parameters is None:
+    off, p = abs(float(found.json.get('gap') or 0.0) / lost - 1.0), found.parameters
+    if p is None:
         return GearOutcome(group, found.usable, off, None, None, 0.0, False)
+    std, initial = found.json['std'], p.estimator.initial
+    estimate = Estimate(
+        initial.m, initial.c_r, initial.c_l, p.proportional.f,
+        *(max(std[name], 1e-6 * abs(found.json['gap'])) for name in ('m', 'c_r', 'c_l')))
     try:
-        run = close_loop(gear, build_controller(found.parameters, found.estimate), motion)
+        run = close_loop(gear, build_controller(p, estimate), motion)
     except (ArithmeticError, ValueError):
         return GearOutcome(group, found.usable, off, 1e3, 0.0, 0.0, False)
     removed = None
     if group == 'presets':
-        none = uncompensated(gear, found.parameters, motion).error
+        none = uncompensated(gear, p, motion).error
         removed = max((none - run.error) / none, -1.0)
     return GearOutcome(
         group, found.usable, off, abs(float(run.gap[-1]) / lost - 1.0), removed,
         float(np.mean(run.status[run.first:] == Status.TRACKING)),
         run.said_tracking_off_by(lost) > OFF,
     )
-
-
-def _identified_gear(gear: Gear) -> Found:
-    v, _, y = record(gear)
-    reach = gear.scale * gear.reach
-    return identified(gear.sample_period * np.arange(len(v)), v, y, {
-        'sample_period': gear.sample_period, 'control.min': -reach, 'control.max': reach,
-        'control.rate_max': gear.scale * gear.rate,
-        'estimator.use_applied_control': 'false',
-    })
 
 
 def gears_figures(gears: Sequence[Sequence[GearOutcome]]) -> dict[str, Figure]:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import cos, pi, radians, sin
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -25,6 +25,8 @@ from gears.gear_runs import PRESETS, Run, close_loop, constant, identified  # no
 from backlash_ros.core.assembly import build_controller  # noqa: E402
 from backlash_ros.core.estimate import Status  # noqa: E402
 
+Array = NDArray[np.float64]
+
 PERIODS = 4  # of a sine with the frequency of the preset
 MAGNIFIED = 20.0  # times which angles are drawn larger
 FRAME_S = 0.06  # a multiple of 0.01 s, as GIF wants it
@@ -32,23 +34,19 @@ WITHOUT_COLOUR, WITH_COLOUR = '#D55E00', '#0072B2'
 PART_COLOURS = {'motor': '#cc7a00', 'load': '#1a66cc', 'reference': '#1a1a1a'}
 
 
-@dataclass(frozen=True)
-class Films:
-    """Both loops. samples: until the reference, which is followed late, is where it began.
-
-    sine_s: period of the reference, over which errors are averaged.
-    """
+class Films(NamedTuple):
+    """Both loops. samples: until the reference, which is followed late, is where it began."""
 
     without: Run
     learned: Run
     samples: int
     sample_period: float
-    sine_s: float
+    sine_s: float  # period of the reference, over which errors are averaged
 
-    def rms(self, run: Run, until: int) -> float:
-        """Error [degrees] over the last period before that sample, or as much as there is."""
-        first = max(until - round(self.sine_s / self.sample_period), 0)
-        return float(np.sqrt(np.mean(_error(run)[first:until + 1]**2)))
+    @property
+    def seconds(self) -> Array:
+        """Time of each sample, shape (N,)."""
+        return self.sample_period * np.arange(self.samples)
 
 
 def run_loops() -> Films:
@@ -131,15 +129,18 @@ class Frames:
             self._figure.text(x, 0.445, part, color=colour, fontsize=11, ha='center')
 
     def draw(self, k: int) -> Image.Image:
-        """The picture at sample k."""
+        """The picture at sample k, with the errors over the last period, or as much as there is."""
         films = self._films
+        begin = max(k - round(films.sine_s / films.sample_period), 0)
         for run, view, text, curve in zip(
             (films.without, films.learned), self._views, self._texts, self._curves, strict=True
         ):
             for part, angles in (('motor', run.motor), ('load', run.y), ('reference', run.y_m)):
                 view.turn(part, angles[k])
-            text.set_text(f'RMS error of the last {films.sine_s:g} s: {films.rms(run, k):.3f}°')
-            curve.set_data(_seconds(films)[:k + 1], _error(run)[:k + 1])
+            error = _error(run)
+            rms = np.sqrt(np.mean(error[begin:k + 1]**2))
+            text.set_text(f'RMS error of the last {films.sine_s:g} s: {rms:.3f}°')
+            curve.set_data(films.seconds[:k + 1], error[:k + 1])
         self._word.set_text(Status(films.learned.status[k]).word)
         self._canvas.draw()
         return Image.fromarray(np.asarray(self._canvas.buffer_rgba())).convert('RGB')
@@ -149,7 +150,7 @@ def _draw_axes(axes: Axes, films: Films) -> list[Any]:
     """The axes of the errors; returns the curves that grow."""
     reach = 1.15 * max(float(np.abs(_error(run)).max()) for run in (films.without, films.learned))
     axes.axhline(0.0, color='0.7', linewidth=0.8)
-    axes.set(xlim=(0.0, _seconds(films)[-1]), ylim=(-reach, reach), xlabel='time [s]',
+    axes.set(xlim=(0.0, films.seconds[-1]), ylim=(-reach, reach), xlabel='time [s]',
              yticks=(-0.4, 0.0, 0.4))
     axes.set_ylabel('load − reference [°]', y=0.35)
     return [
@@ -158,12 +159,8 @@ def _draw_axes(axes: Axes, films: Films) -> list[Any]:
     ]
 
 
-def _seconds(films: Films) -> NDArray[np.float64]:
-    return films.sample_period * np.arange(films.samples)
-
-
-def _error(run: Run) -> NDArray[np.float64]:
-    return (run.y - run.y_m) * 180.0 / pi
+def _error(run: Run) -> Array:
+    return np.degrees(run.y - run.y_m)
 
 
 def main() -> None:
