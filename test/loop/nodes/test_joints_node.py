@@ -113,3 +113,15 @@ def test_joints_begin_where_they_stand() -> None:
         assert made.sent[0] == pytest.approx(
             {'waist': 0.5, 'elbow': -0.25, 'gripper': 0.125}, abs=one_step
         )
+
+
+def test_joints_that_have_news_at_once_tell_them_one_per_sample() -> None:
+    with arm() as made:
+        told: list[str] = []
+        for joint in made.node.joints:
+            joint.diagnose = lambda *known, name=joint.name: told.append(name)
+        made.node._on_reference(dict.fromkeys(JOINTS, 1.0))
+        for count in (1, 2, 3, 3):
+            made.hear(AT_ZERO)
+            assert len(told) == count
+        assert told == list(JOINTS)
