@@ -40,23 +40,23 @@ def pictures(found: Identification) -> Iterator[Picture]:
         ('held_out.png', 'Measured and simulated y on samples that were held out',
          'Simulated from v alone, with a model that was fitted to the samples before: the lines '
          'should lie on each other, and the difference should look like noise.',
-         6.2, draw_held_out),
+         6.2, _held_out),
         ('loop.png', 'The backlash',
          'Left: y over v as measured. Right: what the backlash that was found takes from v, over '
          'v: c<sub>r</sub> while v pushes to the right, c<sub>l</sub> to the left, and in between '
-         'while v crosses the gap after each turn.', 4.6, draw_loop),
+         'while v crosses the gap after each turn.', 4.6, _loop),
         ('gap.png', 'Misfit over the gap',
          'What is left over for each width of the gap, all else refitted to first order. One '
          'narrow valley: the gap is known. Two valleys of one depth: it is not.', 4.2,
-         draw_profile),
+         _profile),
         ('residual.png', 'Residual of the fit',
          'y minus the simulation of the whole record. Its autocorrelation should stay within the '
          'band of white noise; the rounding of an encoder may leave it. Over v it should show no '
          'shape: a slope or a hook is a nonlinearity that is not in the model.',
-         6.6, draw_residual),
+         6.6, _residual),
         ('bode.png', 'Frequency response of m G',
          'How much and how late y answers to u, with a band of two standard deviations. Between '
-         'the dotted lines y moved; outside of them the record says little.', 5.6, draw_bode),
+         'the dotted lines y moved; outside of them the record says little.', 5.6, _bode),
     ):
         figure = Figure(figsize=(10.0, height), constrained_layout=False)
         # Margins that suit all of them: a layout takes as long as to draw it.
@@ -69,8 +69,7 @@ def pictures(found: Identification) -> Iterator[Picture]:
         yield Picture(name, heading, caption, buffer.getvalue())
 
 
-def draw_held_out(figure: Figure, found: Identification, details: Details) -> None:
-    """Measured and simulated y over the samples held out, and their difference."""
+def _held_out(figure: Figure, found: Identification, details: Details) -> None:
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[2.2, 1.0])
     first, y, simulated, rms, _ = details.held_out
     t = found.sample_period * np.arange(first, first + len(simulated), dtype=float)
@@ -84,8 +83,7 @@ def draw_held_out(figure: Figure, found: Identification, details: Details) -> No
     label(lower, '', 'difference', TIME_LABEL)
 
 
-def draw_loop(figure: Figure, found: Identification, details: Details) -> None:
-    """y over v, and v - u / m over v, between the crossings."""
+def _loop(figure: Figure, found: Identification, details: Details) -> None:
     loop_points = 4000  # samples that the curves over v show
     left, right = figure.subplots(1, 2)
     v = details.v[-loop_points:]
@@ -99,8 +97,7 @@ def draw_loop(figure: Figure, found: Identification, details: Details) -> None:
     legend_above(right)
 
 
-def draw_profile(figure: Figure, found: Identification, details: Details) -> None:
-    """RMS of the residual over the gap, whole and near its minimum."""
+def _profile(figure: Figure, found: Identification, details: Details) -> None:
     whole, near = figure.subplots(1, 2)
     (gaps, rms), std = details.profile, found.std['gap']
     close = np.abs(gaps - found.gap) <= max(0.21 * found.gap, 2.0 * BAND_STDS * std)
@@ -114,8 +111,7 @@ def draw_profile(figure: Figure, found: Identification, details: Details) -> Non
     label(near, f'Near {found.gap:.4g} ± {std:.2g}', '', 'gap [v]')
 
 
-def draw_residual(figure: Figure, found: Identification, details: Details) -> None:
-    """Residual over time, its autocorrelation, and the residual over v."""
+def _residual(figure: Figure, found: Identification, details: Details) -> None:
     grid = figure.add_gridspec(2, 2)
     over_time = figure.add_subplot(grid[0, :])
     correlated, over_v = figure.add_subplot(grid[1, 0]), figure.add_subplot(grid[1, 1])
@@ -141,8 +137,7 @@ def draw_residual(figure: Figure, found: Identification, details: Details) -> No
         zero_line(axes)
 
 
-def draw_bode(figure: Figure, found: Identification, details: Details) -> None:
-    """Magnitude and phase of m G, its delay included."""
+def _bode(figure: Figure, found: Identification, details: Details) -> None:
     rooms = figure.subplots(2, 1, sharex=True)
     w = np.geomspace(max(found.frequencies[0] / 5.0, 1e-5), 0.98 * np.pi, 400)
     value = details.response.at(w) * np.exp(-1j * w * found.delay)

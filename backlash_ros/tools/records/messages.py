@@ -151,20 +151,17 @@ def _signals(path: Path) -> tuple[dict[str, Signal], str]:
     content = read_topics(path, lambda topic: topic.message_type in (
         'std_msgs/msg/Float64', 'sensor_msgs/msg/JointState') or (
         topic.message_type == 'std_msgs/msg/Float64MultiArray' and is_command(topic.name)))
-    series: dict[tuple[str, str, str], list[tuple[int, float]]] = {}
+    series: dict[tuple[str, bool, str], list[tuple[int, float]]] = {}
     for topic, messages in sorted(content.messages.items()):
+        name, commanded = topic.removeprefix('/'), is_command(topic)
         for stamp, message in messages:
-            numbers: Iterable[tuple[str, str, float]]
+            numbers: Iterable[tuple[str, str, float]] = [('', '', getattr(message, 'data', 0.0))]
             if hasattr(message, 'name'):
                 numbers = ((f'/{joint}', joint, value) for joint, value in zip(
                     message.name, message.position, strict=False))
             elif hasattr(message, 'layout'):
                 numbers = ((f'[{place}]', '', value) for place, value in enumerate(message.data))
-            else:
-                numbers = [('', '', message.data)]
             for part, joint, value in numbers:
-                series.setdefault((topic, part, joint), []).append((stamp, float(value)))
-    found = {}
-    for (topic, part, joint), pairs in series.items():
-        found[topic.removeprefix('/') + part] = Signal(as_messages(pairs), is_command(topic), joint)
-    return found, content.damage
+                series.setdefault((name + part, commanded, joint), []).append((stamp, float(value)))
+    return {name: Signal(as_messages(pairs), commanded, joint)
+            for (name, commanded, joint), pairs in series.items()}, content.damage
