@@ -25,8 +25,7 @@ def read_run(
     """Read a run; raises InputError.
 
     path: a bag, its .mcap or .db3 file, a folder of results, record.npz or samples.csv. config:
-    parameters of the run; None looks for parameters.yaml beside it. span, axis: the part that is
-    wanted, where there are several.
+    parameters of the run; None looks for parameters.yaml beside it. axis: of several.
     """
     if not path.exists():
         raise InputError(f'{path}: does not exist')

@@ -17,7 +17,7 @@ from backlash_ros.core.plant.backlash import Backlash
 from backlash_ros.core.reference.signal import PERIODIC
 from backlash_ros.core.simulation import metrics
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
-from backlash_ros.core.simulation.run_record import RunRecord
+from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 from backlash_ros.tools.cli import NOTHING, BrokenOffError, InputError, format_table
 from backlash_ros.tools.runs.read_run import run_loop
 from backlash_ros.topics import BACKLASH
@@ -42,10 +42,7 @@ def summarise(
     words = {float(state): state.word for state in Status}
     latency = np.empty(0) if latency_s is None else latency_s[np.isfinite(latency_s)]
 
-    def last(name: str) -> float:
-        return float(run.column(name)[-1])
-
-    learned = run.learned
+    newest, learned = dict(zip(COLUMNS, run.rows[-1].tolist(), strict=True)), run.learned
     return {
         'estimator': parameters.estimator.law if parameters else None,
         'structure': parameters.structure if parameters else None,
@@ -53,9 +50,9 @@ def summarise(
         'sample_period': run.sample_period,
         'lost_samples': run.lost_samples,
         'began_with': _beginning(run, parameters),
-        'final': {name: last(name) for name in (*BACKLASH, 'f')},
-        'final_std': {name: last(f'std_{name}') for name in BACKLASH},
-        'truth': {name: last(f'true_{name}') if run.has_truth else None for name in BACKLASH},
+        'final': {name: newest[name] for name in (*BACKLASH, 'f')},
+        'final_std': {name: newest[f'std_{name}'] for name in BACKLASH},
+        'truth': {name: newest[f'true_{name}'] if run.has_truth else None for name in BACKLASH},
         'settling_time_s': {
             name: metrics.settling_time(t, run.column(name), run.column(f'true_{name}'))
             if run.has_truth else None for name in BACKLASH
@@ -67,7 +64,7 @@ def summarise(
         'loop_latency_ms': {
             f'p{q}': 1e3 * float(np.percentile(latency, q)) for q in (50, 99)
         } if latency.size else None,
-        'final_status': words.get(last('status')),
+        'final_status': words.get(newest['status']),
         'status_share': {word: float(np.mean(status == state)) for state, word in words.items()}
         if status.size else None,
         'model': {
@@ -138,9 +135,8 @@ def control_error(run: RunRecord) -> Array:
 
 def _reference_period(parameters: Parameters | None) -> float | None:
     """Period of y_m [s]; None where it has none or is not known."""
-    if parameters is None or parameters.waveform not in PERIODIC:
-        return None
-    return 2.0 * pi / parameters.frequency
+    periodic = parameters is not None and parameters.waveform in PERIODIC
+    return 2.0 * pi / parameters.frequency if parameters and periodic else None
 
 
 def interesting_parts(run: RunRecord, parameters: Parameters | None) -> tuple[Part, Part]:
