@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import cont2discrete, lfilter
 
-from backlash_ros.core.estimation.play import play
 from backlash_ros.core.identification.motion import strokes
+from backlash_ros.core.plant.backlash import play
 
 Array = NDArray[np.float64]
 

@@ -24,7 +24,7 @@ from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
 from backlash_ros.core import Parameters, build_closed_loop
-from backlash_ros.core.estimation.play import play
+from backlash_ros.core.plant.backlash import play
 from contract.figures import Figure, figure
 
 Array = NDArray[np.float64]

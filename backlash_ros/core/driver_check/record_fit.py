@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Bounds
 from backlash_ros.core.estimation.explanations import (
-    SMALLEST_NOISE,
     Setup,
     Window,
     afresh,
@@ -131,7 +130,7 @@ def _fitted(
     bounds: Bounds | None, delay: int,
 ) -> RecordFit | None:
     """Fit v (N,) and y (N,) after it; None where a constant u explains y as well."""
-    noise_std, wide, swing = max(noise_std, SMALLEST_NOISE), (-1e300, 1e300), float(np.ptp(v))
+    wide, swing = (-1e300, 1e300), float(np.ptp(v))
     record = Window(0, v, y, np.full(len(v), nan))
     for sign in (1.0, -1.0):
         family = PlantFamily(_times(nominal, sign), uncertainty)
@@ -143,7 +142,7 @@ def _fitted(
     if fit is None or not fit.valid:
         return None
     problem = problem_of(setup, record)
-    wild = outliers(problem.residual(fit), noise_std)
+    wild = outliers(problem.residual(fit), setup.noise_std)
     if wild.any():
         record = record._replace(y=np.where(wild, nan, y))
         problem, fit = problem_of(setup, record), afresh(setup, record, also=fit) or fit
@@ -153,11 +152,11 @@ def _fitted(
     p = np.append(fit.p0, problem.input(fit)[0])
     result = RecordFit(
         nominal, learned, fit=fit, sign=sign, delay=delay,
-        predicted=1.0 - fit.rms / max(float(np.nanstd(record.y)), 1e-300),
+        predicted=1.0 - fit.left.rms / max(float(np.nanstd(record.y)), 1e-300),
         reversals=turns(p, 5.0 * fit.gap_std))
     wanted = REVERSALS if len(fit.xi) else 1
     rest = f': {fit.unexplained:.0%} of its motion follows from no backlash and no G' \
-        if fit.correlation > 0.0 and isfinite(fit.unexplained) else ''
+        if fit.left.correlation > 0.0 and isfinite(fit.unexplained) else ''
     std_m, beyond = float(fit.crossings_std[0]), outside_bounds(bounds, fit) if bounds else []
     return replace(result, doubts=tuple(text for true, text in (
         (result.reversals < wanted,
@@ -167,8 +166,8 @@ def _fitted(
         # A gap of 0 is known to 1 % of the swing.
         (not fit.gap_std <= max(STD_GAP * fit.gap, 0.01 * swing),
          f'the gap, about {fit.gap:.4g}, is known to {fit.gap_std:.2g} only{rest}'),
-        *((far, f'{name} would be {value:.4g}, outside of its bounds')
-          for (name, (value, _)), far in zip(result.estimates.items(), beyond, strict=False)),
+        *((True, f'{out.name} would be {result.estimates[out.name][0]:.4g}, outside of its bounds')
+          for out in beyond),
     ) if true))
 
 

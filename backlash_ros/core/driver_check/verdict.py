@@ -208,7 +208,7 @@ def _of_motion(heard: Heard, timing: Timing, lag: int, p: Parameters) -> Iterato
     decisive = 3.0  # log-likelihood by which one delay beats another
     another_delay = fit.margins.get(expected - delay + fit.delay, inf) > decisive
     noisy = best.noise > 3.0 * noise_std  # by more than a guess may be off
-    coloured = best.correlation > 0.5  # unlike the noise of a sensor
+    coloured = best.left.correlation > 0.5  # unlike the noise of a sensor
     predicted = f'predicts {max(fit.predicted, 0.0):.1%} of the motion of y'
     between, corrected = frequencies_of(y), ''
     if fit.model is not fit.nominal:  # the loop learns it too

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum, auto
 from math import inf, sqrt
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +22,8 @@ from backlash_ros.core.estimation.explanations import (
     problem_of,
 )
 from backlash_ros.core.estimation.fit import Problem
-from backlash_ros.core.estimation.play import NEITHER, RIGHT, engaged, reversals
 from backlash_ros.core.estimation.posterior import Prior, Start, WindowFit
+from backlash_ros.core.plant.backlash import Region, engaged, reversals
 
 Array = NDArray[np.float64]
 
@@ -35,75 +36,88 @@ class State(Enum):
     DOUBTED = auto()
 
 
-@dataclass(frozen=True)
-class Inherited:
-    """What was known before the run: m, c_r, c_l (3,) and their covariance (3, 3)."""
+class Known(NamedTuple):
+    """m, c_r, c_l (3,) and their covariance (3, 3)."""
 
     crossings: Array
     cov: Array
 
 
-@dataclass(frozen=True)
-class Belief:
-    """What is believed after the samples before `end`.
+class Kept(NamedTuple):
+    """What is kept of the samples: those from number `first` on, and what the older ones say.
 
-    first: number of the first sample of the record. older, start: what samples before it say.
-    next_at: number of samples at which to look again, thorough_at: for other gaps too. candidate:
-    found once. tried: newest fit that is not known well enough. doubt_from: sample from which on
-    the fit is contradicted. predicted: samples that the fit has predicted since it was adopted.
-    must_predict: how many of them before it is published. adopted_noise: of the fit as adopted.
-    published, cov: of m, c_r, c_l, None while nothing was. rejected: numbers of readings
-    that are outliers. swapped: numbers of the samples over which the other command acted. coasts:
-    whether the load runs on within the gap.
+    rejected: numbers of readings that are outliers. swapped: numbers of the samples over which the
+    other command acted.
     """
 
-    state: State = State.SEARCHING
-    reason: Status = Status.ACQUIRING
-    fit: WindowFit | None = None
     first: int = 0
+    older: Prior | None = None
+    start: Start | None = None
+    rejected: frozenset[int] = frozenset()
+    swapped: frozenset[int] = frozenset()
+
+
+class Trial(NamedTuple):
+    """Samples that a fit must predict before it is published, and has; its noise when adopted."""
+
+    must: int = 0
+    predicted: int = 0
+    noise: float = inf
+
+    @property
+    def lasts(self) -> bool:
+        """Whether the fit follows one that was contradicted and has not held for long."""
+        return self.predicted < settings.LASTING * self.must
+
+    @property
+    def next(self) -> Trial:
+        """That of what contradicts this fit.
+
+        Twice as long where it did not hold for long: what contradicts one explanation after the
+        other is no backlash.
+        """
+        longer = min(2 * self.must, settings.MOST_PREDICTED)
+        return self._replace(must=longer if self.lasts else settings.PREDICTED)
+
+
+@dataclass(frozen=True)
+class Belief:
+    """What is believed after the samples before `end`; inherited: what was known before the run.
+
+    found: newest fit that is not adopted. doubt_from: sample from which on the fit is contradicted.
+    next_at: number of samples at which to look again, thorough_at: for other gaps too. coasts:
+    whether the load runs on within the gap. reason: of what is published.
+    """
+
+    fit: WindowFit | None = None
+    found: WindowFit | None = None
+    doubt_from: int | None = None
     end: int = 0
     next_at: int = settings.FIRST_FIT
     thorough_at: int = 0
-    older: Prior | None = None
-    start: Start | None = None
-    candidate: WindowFit | None = None
-    tried: WindowFit | None = None
-    doubt_from: int | None = None
-    predicted: int = 0
-    must_predict: int = 0
-    adopted_noise: float = inf
-    published: Array | None = None
-    cov: Array | None = None
-    inherited: Inherited | None = None
-    rejected: frozenset[int] = frozenset()
-    swapped: frozenset[int] = frozenset()
+    kept: Kept = field(default_factory=Kept)
+    trial: Trial = field(default_factory=Trial)
+    published: Known | None = None
+    inherited: Known | None = None
+    reason: Status = Status.ACQUIRING
     coasts: bool = False
 
     @property
-    def on_probation(self) -> bool:
-        """Whether the fit follows one that was contradicted and has not held for long."""
-        return self.predicted < settings.LASTING * self.must_predict
+    def state(self) -> State:
+        """How the fit stands to the newest samples."""
+        if self.fit is None:
+            return State.SEARCHING
+        return State.KNOWN if self.doubt_from is None else State.DOUBTED
 
     @property
     def trusted(self) -> bool:
         """Whether the fit explains its samples and is known well enough."""
         return self.state is State.KNOWN and self.reason is not Status.INCONSISTENT
 
-    @property
-    def must_predict_next(self) -> int:
-        """How many samples the next explanation must predict once this one is contradicted.
-
-        Twice as many as this one where it did not hold for long: what contradicts one explanation
-        after the other is no backlash.
-        """
-        if not self.on_probation:
-            return settings.PREDICTED
-        return min(2 * self.must_predict, settings.MOST_PREDICTED)
-
     def problem(self, setup: Setup, record: Window) -> Problem:
         """The fit of a record beside what is believed of the samples before it."""
         walk_std = self.fit.walk_std if self.fit is not None else 0.0
-        return problem_of(setup, record, self.older, self.start, walk_std=walk_std)
+        return problem_of(setup, record, self.kept.older, self.kept.start, walk_std)
 
 
 # --- what is published --------------------------------------------------------------------------
@@ -117,15 +131,15 @@ def published(setup: Setup, belief: Belief) -> Belief:
         return _beside_inherited(setup, belief, fit, belief.inherited)
     if not is_known(setup, fit, settings.REVERSALS):
         return replace(belief, reason=Status.INCONSISTENT)
-    if belief.predicted < belief.must_predict:
+    if belief.trial.predicted < belief.trial.must:
         return belief
-    cov = fit.crossings_cov + np.diag(setup.drift**2 * (belief.end - belief.first) / 3.0)
+    cov = fit.crossings_cov + np.diag(setup.drift**2 * (belief.end - belief.kept.first) / 3.0)
     walked = (fit.walk_std / fit.m) ** 2 * (belief.next_at - belief.end)
-    cov += walked * np.array([[0.0, 0.0, 0.0], [0.0, 1.0, 1.0], [0.0, 1.0, 1.0]])
-    return replace(belief, published=fit.crossings, cov=cov, reason=Status.TRACKING)
+    cov += walked * np.outer([0.0, 1.0, 1.0], [0.0, 1.0, 1.0])
+    return replace(belief, published=Known(fit.crossings, cov), reason=Status.TRACKING)
 
 
-def _beside_inherited(setup: Setup, belief: Belief, fit: WindowFit, known: Inherited) -> Belief:
+def _beside_inherited(setup: Setup, belief: Belief, fit: WindowFit, known: Known) -> Belief:
     """The same where something was known before the run.
 
     What the samples leave unexplained may be gap as well, and the lost motion of a gear differs
@@ -143,19 +157,17 @@ def _beside_inherited(setup: Setup, belief: Belief, fit: WindowFit, known: Inher
         std = sqrt(fit.gap_std**2 + 2.0 * doubt)
         # A gear that is no play leaves systematic residuals, and denies nothing.
         white = not fit.systematic and not noisier(setup, fit)
-        sure = std < replacing * fit.gap and white and fit.turns >= settings.HELD_REVERSALS
-        if sure and belief.predicted >= belief.must_predict:
+        sure = std < replacing * fit.gap and white and fit.left.turns >= settings.HELD_REVERSALS
+        if sure and belief.trial.predicted >= belief.trial.must:
             belief = replace(belief, inherited=None)  # it was that of another plant
         return replace(belief, reason=Status.INCONSISTENT)
     gain = prior @ np.linalg.pinv(cov + prior)
-    joined = known.crossings + gain @ (fit.crossings - known.crossings)
-    left = prior - gain @ prior
-    if np.trace(left[1:, 1:]) > np.trace(known.cov[1:, 1:]):
-        joined, left = known.crossings, known.cov  # agreement makes nothing less certain
-    return replace(
-        belief, published=joined, cov=left,
-        reason=Status.INCONSISTENT if moves_unexplained(setup, fit) else Status.TRACKING,
-    )
+    joined = Known(known.crossings + gain @ (fit.crossings - known.crossings), prior - gain @ prior)
+    if np.trace(joined.cov[1:, 1:]) > np.trace(known.cov[1:, 1:]):
+        joined = known  # agreement makes nothing less certain
+    unexplained = moves_unexplained(setup, fit)
+    return replace(belief, published=joined,
+                   reason=Status.INCONSISTENT if unexplained else Status.TRACKING)
 
 
 # --- what older samples leave -------------------------------------------------------------------
@@ -168,14 +180,11 @@ def excess(setup: Setup, record: Window, problem: Problem, fit: WindowFit) -> in
     """
     count = len(record.v)
     drift = setup.drift**2 * count / 3.0
-    if count > 4 * settings.PREDICTED and (drift > np.diag(fit.crossings_cov)).any():
-        return count // 3
-    if count < settings.LIVELY:
-        return 0
-    if count >= settings.LONGEST:
+    drifts = count > 4 * settings.PREDICTED and (drift > np.diag(fit.crossings_cov)).any()
+    if drifts or count >= settings.LONGEST:
         return count // 3
     turns = reversals(engaged(record.v, problem.input(fit)[0], fit.gap))
-    if len(turns) <= settings.HELD_REVERSALS:
+    if count < settings.LIVELY or len(turns) <= settings.HELD_REVERSALS:
         return 0
     cut = min(count // 3, int(turns[-settings.HELD_REVERSALS]) - 1)
     return cut if cut >= count // 6 else 0
@@ -183,54 +192,45 @@ def excess(setup: Setup, record: Window, problem: Problem, fit: WindowFit) -> in
 
 def shortened(setup: Setup, record: Window, belief: Belief, cut: int) -> Belief:
     """Let the oldest samples go; what they say of theta stays, discounted as they were."""
-    fit = belief.fit
+    fit, kept = belief.fit, belief.kept
     assert fit is not None
     rest = record.between(record.first + cut)
     old = belief.problem(setup, record.between(record.first, rest.first))
-    prior = old.step(replace(fit, knots=np.zeros(0))).prior
     p, _ = old.input(fit)
-    sides = engaged(old.v, p, fit.gap)
-    right = sides[-1] == RIGHT
-    start = None if sides[-1] == NEITHER else Start(float(p[-1] if right else p[-1] - fit.gap),
-                                                    not right)
-    older = None
-    if prior is not None:
-        discount = sqrt(fit.inflation)
-        older = _drifted(setup, fit, Prior(prior.rows / discount, prior.values / discount), cut)
-        if older is not None and fit.walk_std:
-            older = _without_offset(older)
+    side, start = engaged(old.v, p, fit.gap)[-1], None
+    if side != Region.GAP:
+        left = bool(side == Region.LEFT)
+        start = Start(float(p[-1] - fit.gap if left else p[-1]), left)
+    begin = replace(fit, p0=float(p[-1]), x=np.zeros(len(fit.x)), knots=np.zeros(0))
+    older = _aged(setup, fit, old.remembered(replace(fit, knots=begin.knots)), cut)
     for beside in ((older, start), (None, None)):
         problem = problem_of(setup, rest, *beside, walk_std=fit.walk_std)
-        begin = replace(fit, p0=float(p[-1]), x=np.zeros(len(fit.x)), knots=np.zeros(0))
-        shorter = problem.finished(problem.fitted(replace(begin, x=problem.state(begin))))
-        if shorter.rms < 2.0 * fit.rms or beside[0] is None:
+        shorter = problem.finished(problem.fitted(problem.begun(begin)))
+        if shorter.left.rms < 2.0 * fit.left.rms:
             break
-    return replace(
-        belief, fit=shorter, first=rest.first, older=beside[0], start=beside[1],
-        rejected=frozenset(k for k in belief.rejected if k >= rest.first),
-        swapped=frozenset(k for k in belief.swapped if k >= rest.first),
-    )
+    return replace(belief, fit=shorter, kept=Kept(
+        rest.first, *beside, *(
+            frozenset(k for k in numbers if k >= rest.first)
+            for numbers in (kept.rejected, kept.swapped)
+        )))
 
 
-def _drifted(setup: Setup, fit: WindowFit, prior: Prior, samples: int) -> Prior | None:
-    """What is left of a prior after so many samples of drift; None where it says too little."""
-    if not setup.drift.any():
-        return prior
-    rows = prior.rows
-    try:
-        cov = np.linalg.inv(rows.T @ rows)
-    except np.linalg.LinAlgError:
-        return None
-    theta = np.linalg.lstsq(rows, prior.values, rcond=None)[0]
-    m, c_r, _ = fit.crossings
-    by = np.array([[1.0, 0.0, 0.0], [c_r, m, 0.0], [0.0, 1.0, -1.0]])  # of m, o, g
-    cov[:3, :3] += by @ np.diag(setup.drift**2 * samples) @ by.T
-    root = np.linalg.inv(np.linalg.cholesky(cov))
-    return Prior(root, root @ theta)
-
-
-def _without_offset(prior: Prior) -> Prior:
-    """What a prior says of all but o, which has walked on since."""
-    rows = np.column_stack([prior.rows[:, 1], np.delete(prior.rows, 1, axis=1), prior.values])
-    r = np.asarray(np.linalg.qr(rows, mode='r'))[1:]
-    return Prior(np.insert(r[:, 1:-1], 1, 0.0, axis=1), r[:, -1])
+def _aged(setup: Setup, fit: WindowFit, prior: Prior, samples: int) -> Prior | None:
+    """What is left of a prior after so many samples of drift and walk; None for too little."""
+    rows, values = prior.rows / sqrt(fit.inflation), prior.values / sqrt(fit.inflation)
+    if setup.drift.any():
+        try:
+            cov = np.linalg.inv(rows.T @ rows)
+        except np.linalg.LinAlgError:
+            return None
+        m, c_r, _ = fit.crossings
+        by = np.array([[1.0, 0.0, 0.0], [c_r, m, 0.0], [0.0, 1.0, -1.0]])  # of m, o, g
+        theta = np.linalg.lstsq(rows, values, rcond=None)[0]
+        cov[:3, :3] += by @ np.diag(setup.drift**2 * samples) @ by.T
+        rows = np.linalg.inv(np.linalg.cholesky(cov))
+        values = rows @ theta
+    if fit.walk_std:  # o has walked on since
+        both = np.column_stack([rows[:, 1], np.delete(rows, 1, axis=1), values])
+        r = np.asarray(np.linalg.qr(both, mode='r'))[1:]
+        rows, values = np.insert(r[:, 1:-1], 1, 0.0, axis=1), r[:, -1]
+    return Prior(rows, values)

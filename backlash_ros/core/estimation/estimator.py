@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Bounds, Estimate, Status
-from backlash_ros.core.estimation.belief import Belief, Inherited
-from backlash_ros.core.estimation.explanations import SMALLEST_NOISE, Setup, Window, forbidden
-from backlash_ros.core.estimation.observer import Following, Gains, Place, gains_of, place_of
+from backlash_ros.core.estimation.belief import Belief, Kept, Known
+from backlash_ros.core.estimation.explanations import Setup, Window, forbidden
+from backlash_ros.core.estimation.observer import Following, Gain, Place, gains_of, place_of
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.settings import FEWEST, FIRST_FIT, HELD_REVERSALS, LONGEST
 from backlash_ros.core.estimation.states import learn
@@ -32,16 +32,16 @@ from backlash_ros.core.plant.transfer_function import StateModel, TransferFuncti
 
 Array = NDArray[np.float64]
 
-NO_DATA = 20  # lost samples in a row that are worth a state
-CAPACITY = LONGEST + 16_384  # samples that are kept where fits are made
-
 
 class Proposal(NamedTuple):
-    """A G that was learned, its xi (K,), and the gains of its observer."""
+    """A G that was learned, its xi (K,), and the gains of its observer.
+
+    xi is () where G was identified together with the backlash: it is not to be learned again.
+    """
 
     model: StateModel
     xi: Array
-    gains: Gains
+    gains: tuple[Gain, ...] | None
 
 
 class Fitted(NamedTuple):
@@ -59,13 +59,15 @@ def fitted(
 
     model: the G whose state the structure wants. proposed: xi (K,) of the newest proposal.
     """
-    record = Window(samples.first, *samples.columns).swapped(before.swapped)
-    belief = learn(setup, record.between(max(before.first, record.end - LONGEST)), before)
-    fit = belief.fit
+    swapped = before.kept.swapped
+    record = Window(samples.first, *samples.columns).swapped(swapped)
+    first = max(before.kept.first, record.end - LONGEST)
+    belief = learn(setup, record.between(first), before)
+    fit, kept = belief.fit, belief.kept
     if fit is None or belief.published is None:
         return Fitted(belief)
-    part = record.swapped(belief.swapped - before.swapped).between(belief.first, belief.end)
-    place = place_of(fit, part, model, setup.family.memory)
+    part = record.swapped(kept.swapped - swapped).between(kept.first, belief.end)
+    place = place_of(fit, belief.problem(setup, part), model, setup.family.memory)
     if not len(proposed) or not belief.trusted or fit.behind(proposed) <= 1.0:
         return Fitted(belief, place)
     better = setup.family.model_at(fit.xi)
@@ -94,21 +96,19 @@ class MovingHorizon(Law):
         executor: Executor | None = None,
     ) -> None:
         self.estimate = replace(initial, status=Status.ACQUIRING)
+        family, root = PlantFamily(model.transfer_function, uncertainty), sample_period**0.5
         self._setup = Setup(
-            PlantFamily(model.transfer_function, uncertainty), max(noise_std, SMALLEST_NOISE),
-            bounds, bounds.c_r[1] - bounds.c_l[0], initial.c_r - initial.c_l,
-            walk_std * sample_period**0.5, np.array(drift_std) * sample_period**0.5,
+            family, noise_std, bounds, bounds.c_r[1] - bounds.c_l[0], initial.c_r - initial.c_l,
+            walk_std * root, np.array(drift_std) * root,
         )
-        self._channel = (executor or Executor()).open(3, CAPACITY)
+        self._channel = (executor or Executor()).open(3, LONGEST + 16_384)
         self._belief = Belief()
         if initial.learned:
-            known = np.array([initial.m, initial.c_r, initial.c_l])
             std = np.array([initial.std_m, initial.std_c_r, initial.std_c_l])
-            self._belief = Belief(inherited=Inherited(known, np.diag(std**2)), published=known)
+            known = Known(np.array([initial.m, initial.c_r, initial.c_l]), np.diag(std**2))
+            self._belief = Belief(inherited=known, published=known)
         self._following = Following(model, observer)
-        self._nominal = model
-        self._model_known_before = initial.learned  # G was identified together with the backlash
-        self._proposal: Proposal | None = None
+        self._proposal = Proposal(model, np.zeros(0 if initial.learned else family.count), None)
         self._adapting, self._lost_in_a_row, self._failed_fits = True, 0, 0
         self._reattributed = 0  # intervals so far over which the other command acted
         self._skipping_fit = False  # whether the fit under way is of a record that was given up
@@ -122,7 +122,8 @@ class MovingHorizon(Law):
 
     @property
     def covariance(self) -> Array | None:
-        return self._belief.cov
+        published = self._belief.published
+        return None if published is None else published.cov
 
     @property
     def u_hat(self) -> float:
@@ -143,27 +144,25 @@ class MovingHorizon(Law):
 
     @property
     def proposal(self) -> StateModel | None:
-        proposal = self._proposal
-        return None if proposal is None or proposal.model is self.model else proposal.model
+        return None if self._proposal.model is self.model else self._proposal.model
 
     @property
     def learned_model(self) -> StateModel:
-        return self._nominal if self._proposal is None else self._proposal.model
+        return self._proposal.model
 
     @property
     def report(self) -> LawReport:
-        belief = self._belief
-        fit = belief.fit or belief.tried  # that of no use, where there is no other one
+        belief, found = self._belief, self._belief.found
+        fit = belief.fit or found  # that of no use, where there is no other one
         return LawReport(
             noise_ratio=nan if belief.fit is None else belief.fit.noise / self._setup.noise_std,
             unexplained=nan if fit is None else fit.unexplained,
             unconfirmed=belief.inherited is not None and belief.fit is None,
             coasts=belief.coasts,
-            wrong_sign=belief.tried is not None and belief.tried.m < 0.0,
-            undecided=belief.published is None and belief.tried is not None
-            and belief.tried.m > 0.0 and belief.tried.turns >= HELD_REVERSALS,
-            forbidden=None if belief.tried is None
-            else forbidden(self._setup, belief.tried, belief.tried.turns),
+            wrong_sign=found is not None and found.m < 0.0,
+            undecided=belief.published is None and found is not None and found.m > 0.0
+            and found.left.turns >= HELD_REVERSALS,
+            forbidden=None if found is None else forbidden(self._setup, found),
             waiting=self._channel.record.end - belief.end,
             outliers=self._following.outliers,
             reattributed=self._reattributed,
@@ -190,27 +189,23 @@ class MovingHorizon(Law):
         if adapting and not self._adapting:
             # Another record: the samples before it are not those before the next one.
             before, end = self._belief, self._channel.record.end
-            inherited = before.inherited
-            if inherited is None and before.published is not None and before.cov is not None:
-                inherited = Inherited(before.published, before.cov)
             self._belief = Belief(
-                first=end, end=end, next_at=end + FIRST_FIT, published=before.published,
-                cov=before.cov, inherited=inherited,
+                kept=Kept(first=end), end=end, next_at=end + FIRST_FIT, published=before.published,
+                inherited=before.inherited or before.published,
             )
             self._skipping_fit = self._channel.busy
         self._adapting = adapting
 
     def adopt(self, model: StateModel) -> None:
         proposal = self._proposal
-        known = proposal is not None and proposal.model is model
-        self._following.change_model(model, proposal.gains if proposal and known else None)
+        gains = proposal.gains if proposal.model is model else None
+        self._following.change_model(model, gains)
 
     def retune(self, p: Parameters) -> None:
         root = p.sample_period**0.5
         self._setup = replace(
             self._setup, walk_std=p.estimator.input_noise_std * root,
-            drift=np.array(p.estimator.drift_std) * root,
-            noise_std=max(p.estimator.output_noise_std, SMALLEST_NOISE),
+            drift=np.array(p.estimator.drift_std) * root, noise_std=p.estimator.output_noise_std,
         )
 
     def close(self) -> None:
@@ -226,7 +221,7 @@ class MovingHorizon(Law):
         if self._adapting and not (resting and not self._setup.family.integrates):
             self._channel.append(interval.v, nan if y is None else y, interval.other)
         status = self._belief.reason
-        if self._lost_in_a_row >= NO_DATA:
+        if self._lost_in_a_row >= 20:
             status = Status.NO_DATA
         elif resting and following.observer is not None and status is not Status.INCONSISTENT:
             status = Status.NOT_EXCITED
@@ -243,10 +238,9 @@ class MovingHorizon(Law):
         ):
             return
         following.beyond += following.surprised  # once
-        proposed = np.zeros(setup.family.count) if self._proposal is None else self._proposal.xi
         channel.submit(
-            fitted, setup, self._belief, self.model.transfer_function, proposed,
-            since=self._belief.first,
+            fitted, setup, self._belief, self.model.transfer_function, self._proposal.xi,
+            since=self._belief.kept.first,
         )
         self._take(channel.poll())
 
@@ -262,15 +256,13 @@ class MovingHorizon(Law):
             self._belief = replace(self._belief, next_at=self._channel.record.end + FEWEST)
             return
         before, belief, following = self._belief, result.belief, self._following
-        self._belief = belief
-        self._reattributed += len(belief.swapped - before.swapped)
+        self._belief, place, fit = belief, result.place, belief.fit
+        self._reattributed += len(belief.kept.swapped - before.kept.swapped)
         if belief.published is not None and (
             belief.published is not before.published or belief.coasts is not before.coasts
         ):
-            self._publish(belief, belief.published)
-        if result.proposal is not None and not self._model_known_before:
-            self._proposal = result.proposal
-        place, fit = result.place, belief.fit
+            self._publish(belief.published)
+        self._proposal = result.proposal or self._proposal
         if place is None or fit is None:
             return
         if not belief.trusted and following.observer is not None:
@@ -280,14 +272,13 @@ class MovingHorizon(Law):
         newer = record.between(belief.end, record.end).columns[:2]
         following.go_on_from(place, newer, self.estimate, fit.noise, belief.trusted)
 
-    def _publish(self, belief: Belief, values: Array) -> None:
-        e = self.estimate
-        m, c_r, c_l = self._setup.bounds.project(*values.tolist())
-        std_m, std_c_r, std_c_l = (e.std_m, e.std_c_r, e.std_c_l) if belief.cov is None \
-            else np.sqrt(np.maximum(np.diag(belief.cov), 0.0)).tolist()
-        if belief.coasts:
+    def _publish(self, known: Known) -> None:
+        m, c_r, c_l = self._setup.bounds.project(*known.crossings.tolist())
+        std_m, std_c_r, std_c_l = np.sqrt(np.maximum(np.diag(known.cov), 0.0)).tolist()
+        if self._belief.coasts:
             # Motion of the load within the gap makes the gap doubtful: a structure that shrinks it
             # by its deviations pushes the load less.
             doubt = 0.5 * self.report.unexplained * (c_r - c_l)
             std_c_r, std_c_l = hypot(std_c_r, doubt), hypot(std_c_l, doubt)
+        e = self.estimate
         self.estimate = Estimate(m, c_r, c_l, e.f, std_m, std_c_r, std_c_l, e.status)

@@ -14,16 +14,12 @@ from backlash_ros.core.estimate import Bounds
 from backlash_ros.core.estimation import settings
 from backlash_ros.core.estimation.fit import FEW_STEPS, FIRST_STEPS, Problem
 from backlash_ros.core.estimation.plant_family import PlantFamily
-from backlash_ros.core.estimation.play import engaged, play, reversals
 from backlash_ros.core.estimation.posterior import Prior, Start, WindowFit
 from backlash_ros.core.estimation.search import search
 from backlash_ros.core.law import OutOfBounds
+from backlash_ros.core.plant.backlash import engaged, play, reversals
 
 Array = NDArray[np.float64]
-
-FAR_BEHIND = 30.0  # log-likelihood by which a candidate, or no walk of u, is given up
-BY_CHANCE = 3.0  # standard deviations by which an estimate may lie beyond a bound
-SMALLEST_NOISE = 1e-12  # of y, that a setup may have
 
 
 @dataclass(frozen=True)
@@ -41,6 +37,9 @@ class Setup:
     guess: float
     walk_std: float
     drift: Array
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, 'noise_std', max(self.noise_std, 1e-12))
 
 
 class Window(NamedTuple):
@@ -69,21 +68,19 @@ class Window(NamedTuple):
 
     def swapped(self, numbers: frozenset[int]) -> Window:
         """The same where the other command acted over the intervals of these samples."""
-        places = self.places(numbers)
-        if not places:
-            return self
-        v, other = self.v.copy(), self.other.copy()
+        places, v, other = self.places(numbers), self.v.copy(), self.other.copy()
         v[places], other[places] = self.other[places], self.v[places]
         return self._replace(v=v, other=other)
 
     def without(self, numbers: frozenset[int]) -> Window:
         """The same without these readings."""
-        places = self.places(numbers)
-        if not places:
-            return self
         y = self.y.copy()
-        y[places] = np.nan
+        y[self.places(numbers)] = np.nan
         return self._replace(y=y)
+
+    def turns(self, gap: float, p0: float) -> int:
+        """Reversals of the engaged side, for this gap."""
+        return len(reversals(engaged(self.v, play(self.v, gap, p0), gap)))
 
 
 def problem_of(
@@ -104,15 +101,16 @@ def afresh(
     like: G is that of this fit, as well as that knows it. also: where to begin as well. walks:
     whether u may walk. A fit with m < 0 says that y goes the other way.
     """
-    family = setup.family
-    if np.isfinite(record.y).sum() < 15 + 2 * family.count or np.ptp(record.v) == 0.0:
+    family, swing = setup.family, float(np.ptp(record.v))
+    if np.isfinite(record.y).sum() < 15 + 2 * family.count or not swing:
         return None
     p = problem_of(setup, record, None if like is None else of_xi(like))
     # The noise of a first step is at least a twentieth of the motion of y.
     noise = max(setup.noise_std, 0.05 * float(np.nanstd(record.y)))
     xi = np.zeros(family.count) if like is None else like.theta[3:]
-    candidates, apart = 3, 0.1  # gaps of a search that are fitted, and their relative distance
-    hopeless = not may_be_known(setup, record.v)  # whatever is found: to be named, not to be used
+    # Where v has not turned often enough for any gap, what is found is named, but not used.
+    hopeless = record.turns(0.01 * swing, float(record.v[0])) < _turns_needed(setup)
+    candidates, apart = 1 if hopeless else 3, 0.1  # gaps that are fitted, and their distance
     fits: list[WindowFit] = []
     # Once more around G as the best of the first gaps has it.
     again = family.count > 0 and like is None and not hopeless
@@ -122,9 +120,8 @@ def afresh(
             break
         gaps: list[float] = []
         for _, gap, p0, m in found:
-            if len(gaps) == (1 if hopeless else candidates):
-                break
-            if m * found[0].m > 0.0 and all(abs(gap - other) > apart * other for other in gaps):
+            if len(gaps) < candidates and m * found[0].m > 0.0 and \
+                    all(abs(gap - other) > apart * other for other in gaps):
                 gaps.append(gap)
                 theta = np.concatenate([[m, m * (p0 - record.v[0]), gap], xi])
                 start = p.step(
@@ -136,26 +133,21 @@ def afresh(
     if also is not None and also.m > 0.0:
         begins = replace(also.without_intervals, x=np.zeros(1))
         fits.append(p.finished(p.fitted(begins, FIRST_STEPS)))
-    fits = _different([f for f in fits if np.isfinite(f.evidence)])
-    if not fits:
+    fits = sorted((f for f in fits if np.isfinite(f.evidence)), key=lambda f: -f.evidence)
+    different: list[WindowFit] = []
+    for f in fits:
+        if all(abs(f.gap - g.gap) >= 0.1 * sqrt(max(float(g.cov[2, 2]), 0.0)) for g in different):
+            different.append(f)
+    if not different:
         return None
-    top = max(f.evidence for f in fits)
-    fits = [p.finished(p.fitted(f)) if f.evidence > top - FAR_BEHIND else f for f in fits]
+    near = different[0].evidence - settings.FAR_BEHIND
+    fits = [p.finished(p.fitted(f)) if f.evidence > near else f for f in different]
     best = max(fits, key=lambda f: f.evidence)
     if best.m < 0.0 or hopeless:
         return best
     best = with_intervals(p, best)
     best = replace(best, spread=spread(p, best, fits))
     return with_walk(setup, p, best) if walks else best
-
-
-def _different(fits: list[WindowFit]) -> list[WindowFit]:
-    """Fits without those that have come to the same gap as a likelier one."""
-    out: list[WindowFit] = []
-    for f in sorted(fits, key=lambda f: -f.evidence):
-        if all(abs(f.gap - g.gap) >= 0.1 * sqrt(max(float(g.cov[2, 2]), 0.0)) for g in out):
-            out.append(f)
-    return out
 
 
 def with_intervals(p: Problem, f: WindowFit) -> WindowFit:
@@ -184,9 +176,7 @@ def with_intervals(p: Problem, f: WindowFit) -> WindowFit:
             if other.evidence <= best.evidence:
                 break
             best = other
-    if best.rms < 1.5 * f.noise:
-        return best
-    return p.finished(p.fitted(f.without_intervals))
+    return best if best.left.rms < 1.5 * f.noise else p.finished(p.fitted(f.without_intervals))
 
 
 def with_walk(setup: Setup, p: Problem, f: WindowFit) -> WindowFit:
@@ -203,17 +193,15 @@ def with_walk(setup: Setup, p: Problem, f: WindowFit) -> WindowFit:
         best = with_intervals(still, still.fitted(begin))
     if not best.valid or not best.systematic:
         return best
-    for share in shares:
-        walk_std = share * f.m * f.gap / sqrt(len(p.v))
-        if walk_std <= least:
-            continue
-        walking = p.walking(walk_std)
-        g = with_intervals(
-            walking, walking.fitted(replace(begin, walk_std=walk_std), FIRST_STEPS))
-        needed = 0.0 if best.walk_std > least else FAR_BEHIND
-        # Readings of which the walk leaves a correlated rest count as fewer.
-        if g.valid and g.evidence - best.evidence > needed * g.inflation:
-            best = g
+    for walk_std in (share * f.m * f.gap / sqrt(len(p.v)) for share in shares):
+        if walk_std > least:
+            walking = p.walking(walk_std)
+            g = with_intervals(
+                walking, walking.fitted(replace(begin, walk_std=walk_std), FIRST_STEPS))
+            needed = 0.0 if best.walk_std > least else settings.FAR_BEHIND
+            # Readings of which the walk leaves a correlated rest count as fewer.
+            if g.valid and g.evidence - best.evidence > needed * g.inflation:
+                best = g
     return best
 
 
@@ -270,12 +258,6 @@ def of_xi(f: WindowFit) -> Prior | None:
 # --- judgement ----------------------------------------------------------------------------------
 
 
-def may_be_known(setup: Setup, v: Array) -> bool:
-    """Whether v (N,) has turned often enough for any gap to be known."""
-    gap = 0.01 * float(np.ptp(v))
-    return len(reversals(engaged(v, play(v, gap, float(v[0])), gap))) >= _turns_needed(setup)
-
-
 def _turns_needed(setup: Setup) -> int:
     return settings.REVERSALS if setup.family.count else 1
 
@@ -287,19 +269,13 @@ def is_known(setup: Setup, f: WindowFit, turns: int) -> bool:
     deviations must be smaller: what causes that does not average out. A gap is also known where
     its upper end is small beside the first guess: there is none.
     """
-    return _is_precise(setup, f, turns) and not any(outside_bounds(setup.bounds, f))
+    return _is_precise(setup, f, turns) and not outside_bounds(setup.bounds, f)
 
 
-def forbidden(setup: Setup, f: WindowFit, turns: int) -> OutOfBounds | None:
+def forbidden(setup: Setup, f: WindowFit) -> OutOfBounds | None:
     """What keeps a fit that would be known otherwise from being it; None for nothing."""
-    if not _is_precise(setup, f, turns):
-        return None
-    outside = outside_bounds(setup.bounds, f)
-    return next((
-        OutOfBounds(name, value, getattr(setup.bounds, name))
-        for name, value, out in zip(('m', 'c_r', 'c_l'), f.crossings.tolist(), outside, strict=True)
-        if out
-    ), None)
+    outside = outside_bounds(setup.bounds, f) if _is_precise(setup, f, f.left.turns) else []
+    return outside[0] if outside else None
 
 
 def _is_precise(setup: Setup, f: WindowFit, turns: int) -> bool:
@@ -308,7 +284,7 @@ def _is_precise(setup: Setup, f: WindowFit, turns: int) -> bool:
     factor = 1.0 / settings.SYSTEMATIC if f.systematic else 1.0
     std_m, std_c_r, std_c_l = f.crossings_std.tolist()
     gap_known = max(f.gap_std, std_c_r, std_c_l) < factor * settings.STD_GAP * f.gap
-    chance = BY_CHANCE * f.gap_std
+    chance = settings.BY_CHANCE * f.gap_std
     no_gap = f.gap < chance and f.gap + chance < settings.NO_GAP * setup.guess
     return std_m < factor * settings.STD_SLOPE * f.m and (gap_known or no_gap)
 
@@ -323,12 +299,15 @@ def noisier(setup: Setup, f: WindowFit) -> bool:
     return f.noise > settings.AS_GOOD * max(setup.noise_std, f.step / sqrt(12.0))
 
 
-def outside_bounds(bounds: Bounds, f: WindowFit) -> list[bool]:
-    """Whether m, c_r, c_l lie outside of their bounds by more than chance."""
+def outside_bounds(bounds: Bounds, f: WindowFit) -> list[OutOfBounds]:
+    """What of m, c_r, c_l lies outside of its bounds by more than chance."""
     values = f.crossings
     apart = np.abs(values - bounds.project(*values.tolist()))
-    out: list[bool] = (apart > BY_CHANCE * f.crossings_std + 1e-9 * np.abs(values)).tolist()
-    return out
+    outside = apart > settings.BY_CHANCE * f.crossings_std + 1e-9 * np.abs(values)
+    return [
+        OutOfBounds(name, float(value), getattr(bounds, name))
+        for name, value, out in zip(('m', 'c_r', 'c_l'), values, outside, strict=True) if out
+    ]
 
 
 def agree(one: Array, other: Array, cov: Array) -> bool:
@@ -347,12 +326,9 @@ def alike(one: WindowFit, other: WindowFit) -> bool:
 
 def outliers(z: Array) -> NDArray[np.bool_]:
     """Which normalized residuals (N,) are outliers: few, and not many in a row; nan: lost."""
-    wild = np.abs(z) > settings.GATE
-    if not wild.any():
-        return wild
-    if wild.sum() > settings.OUTLIER_SHARE * np.isfinite(z).sum():
+    wild, known = np.abs(z) > settings.GATE, np.flatnonzero(np.isfinite(z))
+    if wild.sum() > settings.OUTLIER_SHARE * len(known):
         return np.zeros_like(wild)
-    known = np.flatnonzero(np.isfinite(z))
     rows = np.flatnonzero(np.diff(np.concatenate([[0], wild[known].astype(int), [0]])))
     for begin, end in zip(rows[::2], rows[1::2], strict=True):
         if end - begin >= settings.OUTLIERS:

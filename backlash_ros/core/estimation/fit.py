@@ -20,10 +20,19 @@ from math import inf, isfinite, log, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.plant_family import Family, filtered, padded, state_columns
-from backlash_ros.core.estimation.play import LEFT, NEITHER, engaged, hats, play, reversals, walk
-from backlash_ros.core.estimation.posterior import Prior, Start, WindowFit, error_of_plant
-from backlash_ros.core.estimation.reading import Likelihood, independence, likelihood, step_of
+from backlash_ros.core.estimation.plant_family import Family, padded, state_columns
+from backlash_ros.core.estimation.posterior import (
+    Left,
+    Likelihood,
+    Prior,
+    Start,
+    WindowFit,
+    error_of_plant,
+    independence,
+    likelihood,
+    step_of,
+)
+from backlash_ros.core.plant.backlash import Region, engaged, play, reversals
 from backlash_ros.core.plant.numerics import lfilter
 
 Array = NDArray[np.float64]
@@ -41,7 +50,7 @@ class _Evaluated:
     p: Array
     u: Array
     y: Array
-    independent: tuple[Array, NDArray[np.intp]] | None = None
+    independent: tuple[Array, NDArray[np.intp]]
     likelihoods: dict[tuple[float, float], Likelihood] = field(default_factory=dict)
 
 
@@ -74,7 +83,11 @@ class Problem:
 
     def _walk_by(self, walk_std: float) -> None:
         count, self.walk_std = len(self.v), walk_std
-        self._hats = hats(count) if walk_std else np.zeros((0, count))
+        knots = min(max(count // 8, 1), 36) if walk_std else 0  # 8 samples apart, or more
+        at = np.linspace(0.0, count - 1.0, knots + 1)
+        self._hats = np.array([  # d by each of its knots, and to 0 at the end
+            np.interp(np.arange(count), at, row) for row in np.eye(knots, knots + 1)
+        ]).reshape(knots, count)
 
     @property
     def _knot_std(self) -> float:
@@ -99,9 +112,12 @@ class Problem:
         p = play(self.v, max(f.gap, 0.0), f.p0)
         u = f.m * p - f.theta[1]
         if len(f.knots):
-            u += walk(f.knots, len(self.v))
+            at = np.linspace(0.0, len(self.v) - 1.0, len(f.knots) + 1)
+            u += np.interp(np.arange(len(self.v)), at, np.append(f.knots, 0.0))
         b, a = self.family.at(f.xi)
-        one = _Evaluated(f, b, a, p, u, filtered(b, a, u, f.x))
+        y = lfilter(b, a, u, padded(f.x, len(a) - 1))
+        independent = independence(self.y, self.known, y, self.step_of_readings)
+        one = _Evaluated(f, b, a, p, u, y, independent)
         self._newest = [one, *self._newest[:2]]
         return one
 
@@ -111,13 +127,7 @@ class Problem:
 
     def weights(self, f: WindowFit) -> Array:
         """How much of an independent reading each one is where y is as f has it (N,)."""
-        return self._independent(f)[0]
-
-    def _independent(self, f: WindowFit) -> tuple[Array, NDArray[np.intp]]:
-        one = self._evaluated(f)
-        if one.independent is None:
-            one.independent = independence(self.y, self.known, one.y, self.step_of_readings)
-        return one.independent
+        return self._evaluated(f).independent[0]
 
     def _likelihood(self, f: WindowFit) -> Likelihood:
         one, how = self._evaluated(f), (f.noise_std, f.step)
@@ -158,16 +168,49 @@ class Problem:
         held: whether the gap stays, so that all else fits it; begun: whether the beginning does.
         Raises LinAlgError where the numbers get too large.
         """
+        from scipy.linalg.lapack import dtrtri  # where fits are made: 31 MB
+
+        r, order = self._triangle(f, held, begun), len(self._evaluated(f).a) - 1
+        size = r.shape[1] - 1
+        k = self.family.count - self.family.leaks
+        n, at = size - k, size - self.family.count - 3  # a leak is one of the first; place of m
+        diagonal = np.abs(np.diag(r))[:n]
+        if not np.isfinite(r).all():
+            raise np.linalg.LinAlgError('the samples leave no finite posterior')
+        inverse = dtrtri(r[:n, :n])[0] if diagonal.min() > 0.0 else np.linalg.pinv(r[:n, :n])
+        by = inverse @ r[:n, n:]
+        freedom = max(float(self.weights(f).sum()) - n, 0.0) + 1.0
+        squares = float(r[size, size]) ** 2 + (self.nominal / f.noise_std) ** 2
+        xi, cov_xi, scale, volume, noise = error_of_plant(
+            f, r[n:, n:], squares, freedom, most_scale)
+        cov = np.empty((size, size))
+        cov[:n, :n] = noise * inverse @ inverse.T + by[:, :-1] @ cov_xi @ by[:, :-1].T
+        cov[:n, n:] = -by[:, :-1] @ cov_xi
+        cov[n:, :n], cov[n:, n:] = cov[:n, n:].T, cov_xi
+        beta = np.concatenate([by[:, -1] - by[:, :-1] @ xi, xi])
+        volume -= float(np.log(np.maximum(diagonal, 1e-300)).sum())
+        if len(self._hats):
+            volume -= len(self._hats) * log(self._knot_std)
+        return replace(
+            f, x=beta[:order], knots=beta[order:at - 1], walk_std=self.walk_std,
+            p0=float(beta[at - 1]), theta=beta[at:], scale=scale, cov=cov[at:, at:], volume=volume,
+        )
+
+    def remembered(self, f: WindowFit) -> Prior:
+        """What the record and what is known beside it say of theta, but for the prior of xi."""
+        r = self._triangle(f, False, False)
+        at = r.shape[1] - 4 - self.family.count
+        return Prior(r[at:-1, at:-1], r[at:-1, -1])
+
+    def _triangle(self, f: WindowFit, held: bool, begun: bool) -> Array:
+        """R of the rows of a step, (P + 1, P + 1)."""
+        from scipy.linalg.lapack import dgeqrf  # as above
+
         stack = self.rows(f, held, begun)
-        size, order = stack.shape[1] - 1, len(self._evaluated(f).a) - 1
         scale = np.maximum(np.sqrt(np.einsum('ij,ij->j', stack, stack)), 1e-300)
         scale[-1] = 1.0
         stack /= scale
-        from scipy.linalg.lapack import dgeqrf  # where fits are made: 31 MB
-
-        r = dgeqrf(stack, overwrite_a=1)[0][:size + 1]
-        return self._solved(
-            f, np.triu(r) * scale, order, float(self.weights(f).sum()), most_scale)
+        return np.asarray(np.triu(dgeqrf(stack, overwrite_a=1)[0][:len(scale)]) * scale)
 
     def rows(self, f: WindowFit, held: bool = False, begun: bool = False) -> Array:
         """The least squares of a step: a row for each sample, then those beside, the target last.
@@ -177,7 +220,7 @@ class Problem:
         _, score, information = self._likelihood(f)
         x = padded(f.x, len(self._evaluated(f).a) - 1)
         beta = np.concatenate([x, self._knots_of(f), [f.p0], f.theta])
-        beside = np.concatenate(self._beside(replace(f, x=x), len(beta), held, begun))
+        beside = self._beside(f, len(x), len(beta), held, begun)
         count = len(self.v)
         stack = np.empty((count + len(beside), len(beta) + 1), order='F')
         rows, stack[count:] = stack[:count], beside
@@ -200,14 +243,14 @@ class Problem:
         b, a = one.b, one.a
         side = engaged(self.v, one.p, max(f.gap, 0.0))
         # A side that has not moved p yet leaves it where it began.
-        side[:int(np.argmax(np.append(one.p != f.p0, True)))] = NEITHER
+        side[:int(np.argmax(np.append(one.p != f.p0, True)))] = Region.GAP
         count, order, walks = len(self.v), len(a) - 1, len(self._hats)
         at = order + walks + 4
         if out is None:
             out = np.empty((count, at + self.family.count), order='F')
         columns = np.zeros((walks + 7, count))
-        columns[0], columns[1], columns[2] = side == NEITHER, one.p, -1.0
-        columns[3], columns[4:-3] = side == LEFT, self._hats
+        columns[0], columns[1], columns[2] = side == Region.GAP, one.p, -1.0
+        columns[3], columns[4:-3] = side == Region.LEFT, self._hats
         columns[[0, 3]] *= f.m
         columns[-3], columns[-2], columns[-1, 0] = one.u, -one.y, 1.0
         once = lfilter([1.0], a, columns)
@@ -223,73 +266,36 @@ class Problem:
             out[:, at:] = np.tensordot(late, slopes, ((0, 1), (1, 2)))
         return out
 
-    def _beside(self, f: WindowFit, size: int, held: bool, begun: bool) -> list[Array]:
-        """Rows of what is known beside the samples, and what gap and beginning are held at."""
+    def _beside(self, f: WindowFit, order: int, size: int, held: bool, begun: bool) -> Array:
+        """Rows (B, P + 1) of what is known beside the samples, the target in the last column."""
         vague = 100.0  # prior deviation of the state before a record, over the largest reading
-        tight = 1e6  # weight of a beginning that is known
-        first = size - 3 - self.family.count  # place of m
-        rows: list[Array] = []
-        if self.older is not None:
-            older = np.zeros((len(self.older.rows), size + 1))
-            older[:, first:-1], older[:, -1] = self.older.rows, self.older.values
-            rows.append(older)
-        wide = np.zeros((1, size + 1))
-        wide[0, first + 2] = 1.0 / max(float(np.ptp(self.v)), 1e-300)  # the gap is within the swing
-        begin = np.zeros((1, size + 1))
-        begin[0, first - 1] = 1.0
+        tight = 1e6  # weight of what is held
+        walks, leaks, older = len(self._hats), self.family.leaks, self.older
+        first, rows = size - 3 - self.family.count, 0 if older is None else len(older.rows)  # of m
+        out = np.zeros((rows + 2 + leaks + order + walks, size + 1))
+        if older is not None:
+            out[:rows, first:-1], out[:rows, -1] = older.rows, older.values
+        of_gap, begin = out[rows], out[rows + 1]
+        of_gap[first + 2] = 1.0 / max(float(np.ptp(self.v)), 1e-300)  # the gap is within the swing
         if held:
-            wide[0, first + 2], wide[0, -1] = tight, tight * f.gap
+            of_gap[first + 2], of_gap[-1] = tight, tight * f.gap
+        begin[first - 1] = tight
         if begun:
-            begin[0, first - 1], begin[0, -1] = tight, tight * f.p0
+            begin[-1] = tight * f.p0
         elif self.start is None:  # anywhere within the gap of now
-            begin[0, -1] = self.v[0] + 0.5 * f.gap
-            begin *= sqrt(12.0) / max(f.gap, 1e-9)
+            begin[first - 1] = sqrt(12.0) / max(f.gap, 1e-9)
+            begin[-1] = (self.v[0] + 0.5 * f.gap) * begin[first - 1]
         else:
-            begin[0, first + 2], begin[0, -1] = -float(self.start.left), self.start.v
-            begin *= tight
-        leak = np.eye(self.family.leaks, size + 1, first + 3)
+            begin[first + 2], begin[-1] = -tight * self.start.left, tight * self.start.v
+        rows += 2
+        out[rows:rows + leaks] = np.eye(leaks, size + 1, first + 3)
         # What no reading tells, as where the first ones were lost, would grow without bounds.
-        state = np.eye(len(f.x), size + 1) / (vague * max(float(np.abs(self.y).max()), 1e-300))
-        rows += [wide, begin, leak, state]
-        if len(self._hats):
-            walks = np.zeros((len(self._hats), size + 1))
-            at = first - 1 - len(self._hats)
-            walks[:, at:first - 1] = np.eye(len(self._hats)) - np.eye(len(self._hats), k=1)
-            rows.append(walks / self._knot_std)
-        return rows
-
-    def _solved(
-        self, f: WindowFit, r: Array, order: int, count: float, most_scale: float,
-    ) -> WindowFit:
-        """Means and covariance from the triangle r (P+1, P+1), the target in its last column."""
-        size = r.shape[1] - 1
-        k = self.family.count - self.family.leaks
-        n, at = size - k, size - self.family.count - 3  # the leak is one of the first; place of m
-        diagonal = np.abs(np.diag(r))[:n]
-        if not np.isfinite(r).all():
-            raise np.linalg.LinAlgError('the samples leave no finite posterior')
-        regular = diagonal.min() > 0.0
-        from scipy.linalg.lapack import dtrtri  # as above
-
-        inverse = dtrtri(r[:n, :n])[0] if regular else np.linalg.pinv(r[:n, :n])
-        by = inverse @ r[:n, n:]
-        freedom = max(count - n, 0.0) + 1.0
-        squares = float(r[size, size]) ** 2 + (self.nominal / f.noise_std) ** 2
-        xi, cov_xi, scale, volume, noise = error_of_plant(
-            f, r[n:, n:], squares, freedom, most_scale)
-        cov = np.empty((size, size))
-        cov[:n, :n] = noise * inverse @ inverse.T + by[:, :-1] @ cov_xi @ by[:, :-1].T
-        cov[:n, n:] = -by[:, :-1] @ cov_xi
-        cov[n:, :n], cov[n:, n:] = cov[:n, n:].T, cov_xi
-        beta = np.concatenate([by[:, -1] - by[:, :-1] @ xi, xi])
-        volume -= float(np.log(np.maximum(diagonal, 1e-300)).sum())
-        if len(self._hats):
-            volume -= len(self._hats) * log(self._knot_std)
-        return replace(
-            f, x=beta[:order], knots=beta[order:at - 1], walk_std=self.walk_std,
-            p0=float(beta[at - 1]), theta=beta[at:], scale=scale, cov=cov[at:, at:], volume=volume,
-            prior=Prior(r[at:size, at:size], r[at:size, size]),
-        )
+        state = 1.0 / (vague * max(float(np.abs(self.y).max()), 1e-300))
+        out[rows + leaks:rows + leaks + order] = state * np.eye(order, size + 1)
+        if walks:
+            between = (np.eye(walks) - np.eye(walks, k=1)) / self._knot_std
+            out[-walks:, first - 1 - walks:first - 1] = between
+        return out
 
     # --- the fit --------------------------------------------------------------------------------
 
@@ -308,16 +314,14 @@ class Problem:
                 other = self._stepped(f, best, weights, most, begun=True)
                 new, there, value = max((new, there, value), other, key=lambda one: one[2])
             if not value > best - 50.0:  # f stands: only its posterior is new, and its noise
-                f = replace(f, cov=new.cov, prior=new.prior, scale=new.scale, volume=new.volume)
+                f = replace(f, cov=new.cov, scale=new.scale, volume=new.volume)
                 noise_std = f.noise_std if f.step else self._noise_of(f)
                 if noise_std > 0.9 * f.noise_std:
                     return f
                 f = replace(f, noise_std=noise_std)
                 continue
             moved = abs(there.gap - f.gap) / max(sqrt(max(new.cov[2, 2], 0.0)), 1e-300)
-            f = there
-            if not f.step:
-                f = replace(f, noise_std=self._noise_of(f))
+            f = there if there.step else replace(there, noise_std=self._noise_of(there))
             if moved < least_move * (1 if steps > FEW_STEPS else 10) and value - best < 1.0:
                 break
         return f
@@ -346,13 +350,11 @@ class Problem:
     def kept(self, f: WindowFit) -> WindowFit:
         """The same with its gap and its beginning where they can be."""
         least = 1e-9  # gap over the swing of v: with none at all, neither side would be told
-        swing = float(np.ptp(self.v))
+        swing, first = float(np.ptp(self.v)), float(self.v[0])
         gap = min(max(f.gap, least * swing), 2.0 * swing)
         theta = np.concatenate([f.theta[:2], [gap], f.theta[3:]])
-        if self.start is not None:
-            return replace(f, theta=theta)
-        first = float(self.v[0])
-        return replace(f, theta=theta, p0=min(max(f.p0, first), first + gap))
+        p0 = f.p0 if self.start is not None else min(max(f.p0, first), first + gap)
+        return replace(f, theta=theta, p0=p0)
 
     def _noise_of(self, f: WindowFit) -> float:
         r = np.where(self.known, self.y - self.output(f), 0.0)
@@ -361,10 +363,10 @@ class Problem:
         return sqrt((float((w * r) @ r) + self.nominal**2) / (free + 1.0))
 
     def finished(self, f: WindowFit) -> WindowFit:
-        """The same with its evidence and the correlation of what is left."""
-        known = self.known
-        r = np.where(known, self.y - self.output(f), 0.0)
-        w, begins = self._independent(f)
+        """The same with what it leaves."""
+        known, evaluated = self.known, self._evaluated(f)
+        r = np.where(known, self.y - evaluated.y, 0.0)
+        w, begins = evaluated.independent
         log_density, score, information = self._likelihood(f)
         count = float(len(begins))
         whole = score / sqrt(float(information[known].mean())) if f.step else r / f.noise_std
@@ -373,28 +375,27 @@ class Problem:
         rho = max(float(e[lag:] @ e[:-lag]) / squares for lag in (1, 2, 4, 8) if lag < len(e))
         rho = max(0.0, rho - 3.0 / sqrt(max(count, 1.0)))
         rho *= min(1.0, squares / max(count, 1.0))  # below the noise there may be anything
-        return replace(
-            f, evidence=float((log_density * w)[known].sum()) + f.volume, correlation=rho,
-            inflation=1.0 - rho + count * rho, count=count,
-            rms=sqrt(float(r @ r) / max(int(known.sum()), 1)),
-            turns=len(reversals(engaged(self.v, self.input(f)[0], max(f.gap, 0.0)))),
-        )
+        turns = reversals(engaged(self.v, evaluated.p, max(f.gap, 0.0)))
+        return replace(f, left=Left(
+            float((log_density * w)[known].sum()), sqrt(float(r @ r) / max(int(known.sum()), 1)),
+            rho, count, len(turns),
+        ))
 
     def explained(self, f: WindowFit) -> Array:
         """y that is expected (N,) with the state before the record and the offset at their best."""
-        order = len(self._evaluated(f).a) - 1
-        columns = self.jacobian(f)[:, [*range(order), order + len(self._hats) + 2]]
-        beyond = (self.y - self.output(f))[self.known]
-        change = np.linalg.lstsq(columns[self.known], beyond, rcond=1e-12)[0]
-        return np.asarray(self.output(f) + columns @ change)
+        return self.output(self.begun(f, True))
 
-    def state(self, f: WindowFit) -> Array:
-        """The state before the record that explains it best, everything else held."""
-        b, a = self.family.at(f.xi)
-        order = len(a) - 1
-        columns = state_columns(a, len(self.v))[self.known]
-        r = (self.y - filtered(b, a, self.input(f)[1], np.zeros(order)))[self.known]
-        return np.asarray(np.linalg.lstsq(columns, r, rcond=1e-12)[0])
+    def begun(self, f: WindowFit, offset: bool = False) -> WindowFit:
+        """The same with the state before the record, and o if that is asked, at their best."""
+        there = self._evaluated(replace(f, x=np.zeros(1)))
+        columns = state_columns(there.a, len(self.v))
+        if offset:
+            of_o = lfilter(there.b, there.a, np.full(len(self.v), -1.0))
+            columns = np.column_stack([columns, of_o])
+        columns = columns[self.known]
+        best = np.linalg.lstsq(columns, (self.y - there.y)[self.known], rcond=1e-12)[0]
+        theta = f.theta + np.eye(len(f.theta))[1] * (best[-1] if offset else 0.0)
+        return replace(f, x=best[:len(there.a) - 1], theta=theta)
 
 
 def _towards(f: WindowFit, new: WindowFit, share: float = 1.0) -> WindowFit:

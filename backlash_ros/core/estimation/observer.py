@@ -21,10 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Estimate
-from backlash_ros.core.estimation.explanations import Window
-from backlash_ros.core.estimation.play import play, walk
+from backlash_ros.core.estimation.fit import Problem
 from backlash_ros.core.estimation.posterior import WindowFit
-from backlash_ros.core.estimation.settings import GATE, OUTLIERS
+from backlash_ros.core.estimation.settings import GATE, OUTLIERS, ROWS
 from backlash_ros.core.law import Interval
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.plant.backlash import clamp
@@ -35,8 +34,6 @@ Array = NDArray[np.float64]
 
 # Noise on u, as its stationary share of y in units of the noise of y, that gains are made for.
 RATIOS = tuple(10.0**exponent for exponent in range(-4, 5))
-REGULAR = 1e-9  # noise on every state beside that on u: keeps the Riccati equation regular
-REMEMBERED = 1500  # samples from which the state of a G is found, at most
 
 
 class Gain(NamedTuple):
@@ -52,66 +49,61 @@ class Gain(NamedTuple):
     quiet: float
 
 
-Gains = dict[float, Gain | None]
-
-
-def gain_of(model: StateModel, ratio: float) -> Gain | None:
-    """Gain for noise on u of this size; None where there is none."""
+def gain_of(model: StateModel, ratio: float) -> Gain:
+    """Gain for noise on u of this size; 0 where there is none."""
     n, transfer = model.order, model.transfer_function
     power = abs(transfer.response(np.array([np.exp(0.1j * np.pi)]))[0])
-    c = np.zeros((n, 1))
-    c[0, 0] = model.c
     noise = np.outer(model.b, model.b) * (ratio / power) ** 2
-    noise += REGULAR * float(np.trace(noise)) * np.eye(n)
+    noise += 1e-9 * float(np.trace(noise)) * np.eye(n)  # keeps the Riccati equation regular
+    c = model.c * np.eye(n)[0]
     try:
-        p = riccati(model.a.T, c[:, 0], noise)
-        variance = float(model.c * p[0, 0] * model.c) + 1.0
-        column = p[:, 0] * model.c / variance
+        p = riccati(model.a.T, c, noise)
+        variance = float(c @ p @ c) + 1.0
+        column = p @ c / variance
         # Error of the prediction with this gain: P = (A - A k c) P (A - A k c)' + A k k' A' + Q.
         after = model.a @ column
         quiet = lyapunov(model.a - np.outer(after, c), np.outer(after, after) + noise * 10.0**-2)
     except np.linalg.LinAlgError:
-        return None
+        return Gain((0.0,) * n, 1.0, np.eye(n), 1.0)
     return Gain(
         tuple((model.to_observer @ column).tolist()), sqrt(variance),
-        p - np.outer(column, column) * variance,
-        sqrt(float(model.c * quiet[0, 0] * model.c) + 1.0),
+        p - np.outer(column, column) * variance, sqrt(float(c @ quiet @ c) + 1.0),
     )
 
 
-def gains_of(model: TransferFunction) -> Gains:
+def gains_of(model: TransferFunction) -> tuple[Gain, ...]:
     """Gains for noise on u of every size."""
     return _gains_of(tuple(model.numerator), tuple(model.denominator))
 
 
 @lru_cache(maxsize=16)
-def _gains_of(numerator: tuple[float, ...], denominator: tuple[float, ...]) -> Gains:
+def _gains_of(numerator: tuple[float, ...], denominator: tuple[float, ...]) -> tuple[Gain, ...]:
     model = StateModel(TransferFunction(numerator, denominator))
-    return {ratio: gain_of(model, ratio) for ratio in RATIOS}
+    return tuple(gain_of(model, ratio) for ratio in RATIOS)
 
 
 class Observer:
-    """Follows the state of G. noise_std: of y.
+    """Follows the state of G. noise_std: of y. gains: where they are known already.
 
-    before: that of another G for the same plant: innovations are no larger with this one. gains:
-    where they are known already.
+    before: that of another G for the same plant: innovations are no larger with this one.
     """
 
     def __init__(
         self, model: StateModel, noise_std: float, before: Observer | None = None,
-        gains: Gains | None = None,
+        gains: tuple[Gain, ...] | None = None,
     ) -> None:
-        self.model, self.noise_std = model, noise_std
-        self._gains: Gains = {} if gains is None else gains
+        self.noise_std = noise_std
+        self._gains = gains or gains_of(model.transfer_function)
+        highest = len(RATIOS) if before is None else before._level
+        self._level: int = min(len(RATIOS) // 2, highest)
+        self.variance = (self._gain.innovation * noise_std) ** 2  # of the innovation, measured
         self._advance = model.transfer_function.advance
         self._x = [0.0] * model.order
-        self._level = len(RATIOS) // 2
-        if before is not None:
-            self._level = min(before._level, self._level)
-        self._gain = self._gain_at(self._level)
-        self.variance = (self._gain.innovation * noise_std) ** 2  # of the innovation, measured
         self._to_state = tuple(map(tuple, model.to_state.tolist()))
-        self.cov: Array = self.noise_cov  # of the state
+
+    @property
+    def _gain(self) -> Gain:
+        return self._gains[self._level]
 
     @property
     def state(self) -> list[float]:
@@ -120,7 +112,7 @@ class Observer:
         return [sum(map(mul, row, x)) for row in self._to_state]
 
     @property
-    def noise_cov(self) -> Array:
+    def cov(self) -> Array:
         """Covariance of the state while the innovations are what they are, shape (n, n)."""
         return self._gain.cov * self.noise_std**2
 
@@ -131,9 +123,7 @@ class Observer:
         it little.
         """
         self._x = x.tolist()
-        if known:
-            self._level, self._gain = 0, self._gain_at(0)
-        self.cov = self.noise_cov
+        self._level = 0 if known else self._level
 
     def predict(self, u: float) -> float:
         """Take u over one period and return the y that is expected after it."""
@@ -147,25 +137,13 @@ class Observer:
         self.variance += (innovation * innovation - self.variance) / 100.0
 
     def settle(self, noise_std: float) -> None:
-        """Go a step towards the smallest gain that explains the innovations.
-
-        noise_std: of y from now on.
-        """
+        """Go a step towards the smallest gain that explains the innovations, with this noise."""
         self.noise_std, gain = noise_std, self._gain
         # What chance explains: 15 % of the deviation.
         if self.variance > (1.15 * gain.innovation * noise_std) ** 2:
             self._level = min(self._level + 1, len(RATIOS) - 1)
         elif self.variance < gain.innovation * gain.quiet * noise_std**2:
             self._level = max(self._level - 1, 0)
-        self._gain = self._gain_at(self._level)
-        self.cov = self.noise_cov
-
-    def _gain_at(self, level: int) -> Gain:
-        ratio = RATIOS[level]
-        if ratio not in self._gains:
-            self._gains[ratio] = gain_of(self.model, ratio)
-        n = self.model.order
-        return self._gains[ratio] or Gain((0.0,) * n, 1.0, np.eye(n), 1.0)
 
 
 class Place(NamedTuple):
@@ -180,20 +158,17 @@ class Place(NamedTuple):
     y: Array
     x: Array
     model: TransferFunction
-    gains: Gains
+    gains: tuple[Gain, ...]
 
 
-def place_of(fit: WindowFit, record: Window, model: TransferFunction, memory: int) -> Place:
-    """Where this fit of the record says that play and this G stand after it.
+def place_of(fit: WindowFit, problem: Problem, model: TransferFunction, memory: int) -> Place:
+    """Where this fit of a record says that play and this G stand after it.
 
     memory: of G [samples].
     """
-    p = play(record.v, max(fit.gap, 0.0), fit.p0)
-    count = min(len(p), 4 * memory, REMEMBERED)
-    u, y = fit.m * p - fit.theta[1], record.y[-count:]
-    if len(fit.knots):
-        u += walk(fit.knots, len(u))
-    u = u[-count:]
+    p, u = problem.input(fit)
+    newest = slice(-min(len(p), 4 * memory, ROWS), None)
+    u, y = u[newest], np.where(problem.known, problem.y, nan)[newest]
     return Place(float(p[-1]), u, y, state_after(model, u, y), model, gains_of(model))
 
 
@@ -225,8 +200,7 @@ class Following:
         self.u = self.innovation = nan
         self.since_motion = self.outliers = self.beyond = 0
         self._p = nan  # v until a backlash is known
-        self._u: deque[float] = deque(maxlen=REMEMBERED)  # over the newest samples
-        self._y: deque[float] = deque(maxlen=REMEMBERED)
+        self._newest: deque[tuple[float, float]] = deque(maxlen=ROWS)  # u and y
 
     @property
     def surprised(self) -> bool:
@@ -242,32 +216,21 @@ class Following:
             else self.before.x_hat.tolist()
         return state
 
-    def change_model(self, model: StateModel, gains: Gains | None) -> None:
+    def change_model(self, model: StateModel, gains: tuple[Gain, ...] | None) -> None:
         """Give the state of this G from now on; gains: of its observer."""
         self.model = model
         if self.before is not None:
             self.before = self.before.with_model(model)
         if self.observer is not None:
             self.observer = Observer(model, self.observer.noise_std, self.observer, gains)
-            y = np.array(self._y)
+            u, y = np.array(self._newest).reshape(-1, 2).T
             if np.isfinite(y).sum() > model.order:
-                x = state_after(model.transfer_function, np.array(self._u), y)
-                self.observer.place(x, True)
-
-    def _is_of(self, place: Place) -> bool:
-        """Whether a place is one of this G."""
-        own, of = self.model.transfer_function, place.model
-        return of is own or (
-            np.array_equal(of.denominator, own.denominator)
-            and np.array_equal(of.numerator, own.numerator)
-        )
+                self.observer.place(state_after(model.transfer_function, u, y), True)
 
     def step(self, y: float | None, interval: Interval, estimate: Estimate) -> None:
         """Take in y(k), None if it was lost, and v of the interval before it."""
-        observer = self.observer
-        p = v = interval.v
-        if observer is not None:
-            p = clamp(self._p, v, v + estimate.c_r - estimate.c_l)
+        observer, v = self.observer, interval.v
+        p = v if observer is None else clamp(self._p, v, v + estimate.c_r - estimate.c_l)
         self.since_motion = self.since_motion + 1 if p == self._p else 0
         self._p = p
         if observer is None:
@@ -275,8 +238,7 @@ class Following:
                 self.before.update(y, interval)
             return
         self.u = u = estimate.m * (p - estimate.c_r)
-        self._u.append(u)
-        self._y.append(nan if y is None else y)
+        self._newest.append((u, nan if y is None else y))
         expected = observer.predict(u)
         if y is None:
             self.innovation = nan
@@ -297,24 +259,24 @@ class Following:
         newer: v and y of the samples since then (2, M). known: whether the fit explains all of its
         samples, so that it knows the state better than the newest of them do.
         """
-        follows = self._is_of(place)
+        own = self.model.transfer_function
+        follows = own is place.model or (
+            np.array_equal(place.model.denominator, own.denominator)
+            and np.array_equal(place.model.numerator, own.numerator))
         if self.observer is None:
             self.observer = Observer(self.model, noise_std, None, place.gains if follows else None)
         else:
             self.observer.settle(noise_std)
-        observer, gap, p = self.observer, estimate.c_r - estimate.c_l, place.p
-        for remembered, values in ((self._u, place.u), (self._y, place.y)):
-            remembered.clear()
-            remembered.extend(values.tolist())
+        observer, gap = self.observer, estimate.c_r - estimate.c_l
+        self._newest = deque(np.column_stack([place.u, place.y]).tolist(), ROWS)
+        self._p, self.u = place.p, estimate.m * (place.p - estimate.c_r)
         if follows:
             observer.place(place.x, known)
         for v, y in newer.T.tolist():
-            p = clamp(p, v, v + gap)
-            u = estimate.m * (p - estimate.c_r)
-            self._u.append(u)
-            self._y.append(y)
+            self._p = clamp(self._p, v, v + gap)
+            self.u = estimate.m * (self._p - estimate.c_r)
+            self._newest.append((self.u, y))
             if follows:
-                innovation = y - observer.predict(u)
+                innovation = y - observer.predict(self.u)
                 if innovation * innovation <= GATE**2 * observer.variance:  # not where y was lost
                     observer.correct(innovation)
-        self._p, self.u = p, estimate.m * (p - estimate.c_r)

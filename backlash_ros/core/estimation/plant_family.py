@@ -15,7 +15,9 @@ they are.
 
 from __future__ import annotations
 
-from math import cos, cosh, exp, floor, inf, log, sin, sinh, sqrt
+from cmath import cos, exp, sqrt
+from collections.abc import Sequence
+from math import copysign, floor, inf
 from typing import Protocol
 
 import numpy as np
@@ -26,8 +28,6 @@ from backlash_ros.core.plant.numerics import lfilter
 from backlash_ros.core.plant.transfer_function import TransferFunction, memory_of
 
 Array = NDArray[np.float64]
-
-LEAK = 5e-3  # prior deviation of the leak of an integrator, per sample and unit of uncertainty
 
 
 class Family(Protocol):
@@ -59,174 +59,132 @@ class PlantFamily:
     """G(z; xi) around a nominal G.
 
     model: the nominal G. uncertainty: relative prior deviation r of its frequencies, damping ratios
-    and delay; 0 where G is exact. count: K, 0 where G is exact. leaks: how many of the first xi are
-    leaks, whose size says nothing of how wrong the rest of G is. integrates: whether
-    it has a pole at 1. memory: samples after which the
-    slowest stable mode has died out, within reason.
+    and delay; 0 where G is exact. integrates: whether it has a pole at 1. memory: samples after
+    which the slowest stable mode has died out, within reason.
     """
 
     def __init__(self, model: TransferFunction, uncertainty: float) -> None:
         widest = 0.125  # width of what acts half a sample late
+        of_leak = 5e-3  # prior deviation of the leak, per sample and unit of uncertainty
         b = np.trim_zeros(model.numerator, 'f')
-        self.model, self.uncertainty = model, uncertainty
+        self.model = model
         self._delay = len(model.denominator) - len(b)
         poles = model.poles
         integrators = abs(poles - 1.0) < ON_CIRCLE
         moving = (abs(poles) > ON_CIRCLE) & (abs(poles) < 1.0 - ON_CIRCLE)
         moving &= ~((poles.imag == 0.0) & (poles.real < 0.0))
         fixed = ~integrators & ~moving & (abs(poles) > ON_CIRCLE)
-        self._integrators = int(integrators.sum())
-        self._fixed: list[float] = np.real(np.poly(poles[fixed])).tolist() if fixed.any() else [1.0]
+        self.integrates = bool(integrators.any())
+        # Denominator of the poles that do not move, but for the first integrator.
+        rest = [*poles[fixed], *[1.0] * (int(integrators.sum()) - 1)]
+        self._rest: list[float] = np.atleast_1d(np.real(np.poly(rest))).tolist()
         self._pairs, self._nominal = _sections(poles[moving])
-        a = _product(*(section for section, _ in self._sections_at(self._nominal)))
+        a = self._stable(self._nominal)
         self._gain = sum(a)
         late = max(self._delay + _mean(b.tolist()) - _mean(a), 1.0)
-        self._scales: list[float] = []
-        self._limits: list[float] = []  # of what is moved by xi
+        # Prior deviation and limit of what each xi moves: a leak of 0.1 a sample, a lag of 40
+        # samples, a factor of 20 on Omega and D.
+        self._scales: list[tuple[float, float]] = []
         if uncertainty > 0.0:
-            # A leak of 0.1 a sample, a lag of 40 samples, a factor of 20 on Omega and D.
-            leak = [LEAK * uncertainty] if self._integrators else []
             self._scales = [
-                *leak, uncertainty * late, widest, *([uncertainty] * len(self._nominal))
+                *[(of_leak * uncertainty, 0.1)] * self.integrates, (uncertainty * late, 40.0),
+                (widest, inf), *[(uncertainty, 3.0)] * len(self._nominal),
             ]
-            self._limits = [*([0.1] * len(leak)), 40.0, inf, *([3.0] * len(self._nominal))]
-        self.leaks = int(bool(self._scales) and self._integrators > 0)
-        self.count = len(self._scales)
-        self.integrates = self._integrators > 0
         shorter = np.atleast_1d(np.poly([-1.0] * max(len(b) - 2, 0)))
         wide = np.convolve(shorter * b.sum() / shorter.sum(), [1.0, -2.0, 1.0])
-        self._b, later, self._wide = (
-            np.pad(taps, (0, max(len(b) + 1, 3) - len(taps))).tolist()
+        taps, later, wide = (
+            np.pad(taps, (0, max(len(b) + 1, 3) - len(taps)))
             for taps in (b, np.append(0.0, b), wide)
         )
-        self._move = [x - y for x, y in zip(later, self._b, strict=True)]
-        slowest = max((abs(pole) for pole in poles[moving]), default=0.0)
-        self.memory = memory_of(slowest)
+        # B, and what it changes by with lag and width.
+        self._taps: list[list[float]] = [taps.tolist(), (later - taps).tolist(), wide.tolist()]
+        self.memory = memory_of(max((abs(pole) for pole in poles[moving]), default=0.0))
+
+    @property
+    def count(self) -> int:
+        """K, 0 where G is exact."""
+        return len(self._scales)
+
+    @property
+    def leaks(self) -> int:
+        """How many xi are leaks, whose size says nothing of how wrong the rest of G is."""
+        return int(self.integrates and bool(self._scales))
 
     def at(self, xi: list[float]) -> tuple[list[float], list[float]]:
-        leak, lag, width, logs = self._moved(xi)
-        stable = _product(*(section for section, _ in self._sections_at(logs)))
-        gain, rest = sum(stable) / self._gain, self._rest([1.0, -1.0 + leak])
-        whole, taps = self._taps(lag, width)
-        b = [0.0] * (self._delay + whole - 1) + [gain * tap for tap in taps]
-        a = _product(stable, rest)
+        b, a = self._coefficients(xi)
+        return [x.real for x in b], [x.real for x in a]
+
+    def slopes(self, xi: list[float]) -> tuple[Array, Array]:
+        # By a complex step, exact to rounding: W. Squire, G. Trapp, SIAM Review 40 (1998) 110-112.
+        h = 1e-30
+        rows = [
+            self._coefficients([x + 1j * h * (i == j) for i, x in enumerate(xi)])
+            for j in range(len(xi))
+        ]
+        shape = len(xi), 2, len(self.at(xi)[1])
+        of_b, of_a = np.array(rows, complex).reshape(shape).imag.swapaxes(0, 1) / h
+        return of_b, of_a
+
+    def _coefficients(self, xi: Sequence[complex]) -> tuple[list[complex], list[complex]]:
+        """b and a at xi; beyond its limit an xi changes nothing more."""
+        moved = [
+            scale * x if abs(scale * x.real) < limit else copysign(limit, x.real)
+            for x, (scale, limit) in zip(xi, self._scales, strict=True)
+        ] or [0.0] * (2 + len(self._nominal))
+        integrator = [1.0, -1.0 + (moved.pop(0) if self.leaks else 0.0)] * self.integrates
+        lag, width, *logs = moved
+        stable = self._stable([x + y for x, y in zip(self._nominal, logs, strict=True)])
+        whole = max(floor(lag.real), 1 - self._delay)
+        gain = sum(stable) / self._gain
+        b = [0j] * (self._delay + whole - 1) + [
+            gain * (x + (lag - whole) * move + width * wide)
+            for x, move, wide in zip(*self._taps, strict=True)
+        ]
+        a = _product(stable, self._rest, integrator or [1.0])
         while not self.count and not b[-1]:  # the same length at every xi, where there are any
             b.pop()
         length = max(len(a), len(b))
-        return b + [0.0] * (length - len(b)), a + [0.0] * (length - len(a))
+        return b + [0j] * (length - len(b)), a + [0j] * (length - len(a))
 
-    def slopes(self, xi: list[float]) -> tuple[Array, Array]:
-        leak, lag, width, logs = self._moved(xi)
-        sections = self._sections_at(logs)
-        stable = _product(*(section for section, _ in sections))
-        gain, rest = sum(stable) / self._gain, self._rest([1.0, -1.0 + leak])
-        whole, taps = self._taps(lag, width)
-        rows: list[tuple[list[float], list[float]]] = []  # b without its first zeros, and a
-        if self.leaks:
-            rows.append(([], _product(stable, self._rest([0.0, 1.0]))))
-        rows += [([gain * x for x in of_b], []) for of_b in (self._move, self._wide)]
-        for i, (_, slopes) in enumerate(sections):
-            others = [section for k, (section, _) in enumerate(sections) if k != i]
-            for slope in slopes:
-                moved = _product(slope, *others)
-                of_gain = sum(moved) / self._gain
-                rows.append(([of_gain * tap for tap in taps], _product(moved, rest)))
-        zeros = self._delay + whole - 1
-        out = np.zeros((2, self.count, max(zeros + len(taps), len(stable) + len(rest) - 1)))
-        for j, (of_b, of_a) in enumerate(rows[:self.count]):
-            free = abs(xi[j] * self._scales[j]) < self._limits[j]
-            out[0, j, zeros:zeros + len(of_b)] = of_b
-            out[1, j, :len(of_a)] = of_a
-            out[:, j] *= self._scales[j] * free
-        return out[0], out[1]
-
-    def _moved(self, xi: list[float]) -> tuple[float, float, float, list[float]]:
-        """Leak, lag and width, and ln Omega, ln D of pairs, ln of the rest."""
-        if not self.count:
-            return 0.0, 0.0, 0.0, self._nominal
-        moved = [
-            min(max(x * scale, -limit), limit)
-            for x, scale, limit in zip(xi, self._scales, self._limits, strict=True)
-        ]
-        leak = moved.pop(0) if self.leaks else 0.0
-        return leak, moved[0], moved[1], [
-            x + apart for x, apart in zip(self._nominal, moved[2:], strict=True)
-        ]
-
-    def _taps(self, lag: float, width: float) -> tuple[int, list[float]]:
-        """Whole samples of the lag, and the numerator beside them, with the nominal gain."""
-        whole = max(floor(lag), 1 - self._delay)
-        part = lag - whole
-        return whole, [
-            x + part * dx + width * y
-            for x, dx, y in zip(self._b, self._move, self._wide, strict=True)
-        ]
-
-    def _rest(self, integrator: list[float]) -> list[float]:
-        """Denominator of the poles that do not move but for a leak, the first integrator given."""
-        if not self._integrators:
-            return self._fixed
-        return _product(self._fixed, integrator, *([[1.0, -1.0]] * (self._integrators - 1)))
+    def _stable(self, logs: Sequence[complex]) -> list[complex]:
+        """Denominator of the poles that may move."""
+        pairs = zip(logs[:2 * self._pairs:2], logs[1:2 * self._pairs:2], strict=True)
+        a = [1.0 + 0j]
+        for omega, damping in ((exp(x), exp(y)) for x, y in pairs):
+            r, square = exp(-omega * damping), omega * omega * (1.0 - damping * damping)
+            a = _product(a, [1.0, -2.0 * r * cos(sqrt(square)), r * r])
+        for value in logs[2 * self._pairs:]:
+            a = _product(a, [1.0, -exp(-exp(value))])
+        return a
 
     def model_at(self, xi: list[float]) -> TransferFunction:
         """G(z; xi) as a transfer function."""
         b, a = self.at(xi)
-        numerator = np.trim_zeros(np.array([0.0, *b]), 'b')
-        denominator = np.trim_zeros(np.array(a), 'b')
+        numerator, denominator = (np.trim_zeros(np.array(x), 'b') for x in ([0.0, *b], a))
         length = max(len(numerator), len(denominator))
-        return TransferFunction(
-            np.pad(numerator, (0, length - len(numerator))).tolist(),
-            np.pad(denominator, (0, length - len(denominator))).tolist(),
-        )
+        return TransferFunction(*(
+            np.pad(x, (0, length - len(x))).tolist() for x in (numerator, denominator)))
 
     def response_slopes(self, xi: list[float], z: NDArray[np.complex128]) -> NDArray[np.complex128]:
         """Derivatives of ln G(z; xi) by each xi at the points z (M,), shape (M, K)."""
-        b, a = self.at(xi)
         db, da = self.slopes(xi)
-        powers = 1.0 / z[:, None] ** np.arange(max(len(b), db.shape[1]))
-        of_b, of_a = powers[:, :len(b)] @ np.array(b), powers[:, :len(a)] @ np.array(a)
-        slopes = powers[:, :db.shape[1]]
-        return np.asarray(slopes @ db.T / of_b[:, None] - slopes @ da.T / of_a[:, None])
-
-    def _sections_at(self, logs: list[float]) -> list[tuple[list[float], list[list[float]]]]:
-        """Denominators of the poles that may move, each with its derivatives by its logs."""
-        out = []
-        for i in range(self._pairs):
-            omega, damping = exp(logs[2 * i]), exp(logs[2 * i + 1])
-            r, square = exp(-omega * damping), omega * omega * (1.0 - damping * damping)
-            angle = sqrt(abs(square))
-            middle, sinc = (cos(angle), sin(angle)) if square > 0.0 else (cosh(angle), sinh(angle))
-            sinc = sinc / angle if angle > 1e-9 else 1.0
-            shrink, turns = -omega * damping, (-sinc * square, sinc * (omega * damping) ** 2)
-            out.append(([1.0, -2.0 * r * middle, r * r], [
-                [0.0, -2.0 * r * (shrink * middle + turn), 2.0 * shrink * r * r] for turn in turns
-            ]))
-        for value in logs[2 * self._pairs:]:
-            pole = exp(-exp(value))
-            out.append(([1.0, -pole], [[0.0, exp(value) * pole]]))
-        return out
-
-
-def filtered(b: list[float], a: list[float], u: Array, x: Array) -> Array:
-    """Output of the filter b / a from the state x before u (N,)."""
-    return lfilter(b, a, u, padded(x, len(a) - 1))
+        powers = 1.0 / z[:, None] ** np.arange(db.shape[1])
+        of_b, of_a = (powers[:, :len(x)] @ np.array(x) for x in self.at(xi))
+        return np.asarray(powers @ db.T / of_b[:, None] - powers @ da.T / of_a[:, None])
 
 
 def padded(x: Array, length: int) -> Array:
     """The first values of x, and zeros behind them, (length,)."""
-    out = np.zeros(length)
-    out[:min(length, len(x))] = x[:length]
-    return out
+    return np.pad(x[:length], (0, max(length - len(x), 0)))
 
 
 def state_columns(a: list[float], count: int) -> Array:
     """How outputs depend on the state before them, shape (count, order)."""
-    impulse = np.zeros(count)
-    impulse[0] = 1.0
-    once = lfilter([1.0], a, impulse)
-    return np.column_stack([np.zeros((count, 0)), *(
-        np.concatenate([np.zeros(i), once[:count - i]]) for i in range(len(a) - 1)
-    )])
+    once = lfilter([1.0], a, np.eye(1, count)[0])
+    out = np.zeros((count, len(a) - 1))
+    for i in range(len(a) - 1):
+        out[i:, i] = once[:count - i]
+    return out
 
 
 def _sections(poles: NDArray[np.complex128]) -> tuple[int, list[float]]:
@@ -236,16 +194,16 @@ def _sections(poles: NDArray[np.complex128]) -> tuple[int, list[float]]:
     real = sorted(-x.real for x in s if abs(x.imag) <= 1e-9)
     while len(real) > 1:
         fast, next_to_it = real.pop(), real.pop()
-        omega = sqrt(fast * next_to_it)
+        omega = np.sqrt(fast * next_to_it)
         pairs.append((omega, (fast + next_to_it) / 2.0 / omega))
-    return len(pairs), [log(q) for pair in pairs for q in pair] + [log(q) for q in real]
+    return len(pairs), np.log([*(q for pair in pairs for q in pair), *real]).tolist()
 
 
-def _product(*factors: list[float]) -> list[float]:
+def _product(*factors: Sequence[complex]) -> list[complex]:
     """Coefficients of a product of polynomials: for so few, faster than np.convolve."""
-    product = [1.0]
+    product = [1.0 + 0j]
     for factor in factors:
-        out = [0.0] * (len(product) + len(factor) - 1)
+        out = [0j] * (len(product) + len(factor) - 1)
         for i, x in enumerate(product):
             for j, y in enumerate(factor):
                 out[i + j] += x * y
@@ -253,7 +211,7 @@ def _product(*factors: list[float]) -> list[float]:
     return product
 
 
-def _mean(taps: list[float]) -> float:
+def _mean(taps: Sequence[complex]) -> float:
     """Delay of slow motion in taps [samples]."""
-    gain = sum(taps)
-    return sum(i * tap for i, tap in enumerate(taps)) / gain if gain else 0.0
+    gain = sum(taps).real
+    return sum(i * tap.real for i, tap in enumerate(taps)) / gain if gain else 0.0

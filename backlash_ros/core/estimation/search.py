@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.plant_family import Family, state_columns
-from backlash_ros.core.estimation.play import plays
 from backlash_ros.core.estimation.settings import ROWS
+from backlash_ros.core.plant.backlash import play
 from backlash_ros.core.plant.numerics import lfilter
 
 Array = NDArray[np.float64]
@@ -60,21 +60,23 @@ class _Comparison:
     def __init__(
         self, family: Family, v: Array, y: Array, noise_std: float, xi: list[float],
     ) -> None:
-        self._family, self._v = family, v
-        self._b, self._a = family.at(xi)
-        self._slopes = family.slopes(xi)
+        self._family, self._v, self._xi, self._nominal = family, v, xi, noise_std
         self._known = np.isfinite(y)
         self._begins, self._weights = _bins(v, self._known)
-        common = np.column_stack([
-            state_columns(self._a, len(v)), lfilter(self._b, self._a, np.ones(len(v)))
-        ])
+        b, a = family.at(xi)
+        common = np.column_stack([state_columns(a, len(v)), lfilter(b, a, np.ones(len(v)))])
         self._q = np.linalg.qr(self._averaged(common.T).T)[0]
         self._y = self._without_common(self._averaged(np.where(self._known, y, 0.0)))
-        self._nominal = noise_std
-        self._rows = len(self._y)
-        self._freedom = max(self._rows - self._q.shape[1], 1)
-        squares = float(self._y @ self._y) + noise_std**2
-        self.null = -0.5 * self._freedom * float(np.log(squares / self._rows))
+        self.null = float(self._value(self._y @ self._y))
+
+    @property
+    def _freedom(self) -> int:
+        return max(self._q.shape[0] - self._q.shape[1], 1)
+
+    def _value(self, squares: Array) -> Array:
+        """Evidence of what leaves these squares, noise integrated out."""
+        rows = self._q.shape[0]
+        return np.asarray(-0.5 * self._freedom * np.log((squares + self._nominal**2) / rows))
 
     def _averaged(self, columns: Array) -> Array:
         """Columns (..., N) summed over bins and divided by the root of the readings in each."""
@@ -87,65 +89,57 @@ class _Comparison:
 
     def evidence(self, gaps: Array, shares: Array) -> list[Hypothesis]:
         """The best beginning of each gap; shares: places of it within the gap."""
-        out = []
         each = max(2_000_000 // (len(shares) * len(self._v)), 1)  # numbers that are held at once
-        for first in range(0, len(gaps), each):
-            out += self._evidence(gaps[first:first + each], shares)
-        return out
-
-    def _evidence(self, gaps: Array, shares: Array) -> list[Hypothesis]:
+        if len(gaps) > each:
+            return self.evidence(gaps[:each], shares) + self.evidence(gaps[each:], shares)
+        b, a = self._family.at(self._xi)
         g = np.repeat(gaps, len(shares))
         begins = self._v[0] + np.tile(shares, len(gaps)) * g
-        p = plays(self._v, g, begins)
+        p = play(self._v, g, begins)
         begun = np.logical_and.accumulate(p == p[:, :1], axis=1).astype(np.float64)
-        once = lfilter([1.0], self._a, np.stack([p, begun], axis=1))
-        of_u = lfilter(self._b, [1.0], once)
-        columns = [self._averaged(of_u)]
+        columns = [self._averaged(lfilter(b, [1.0], lfilter([1.0], a, np.stack([p, begun], 1))))]
         if self._family.count:
             # xi changes no constant part of u: that keeps to o.
-            move = lfilter([1.0], self._a, p - p[:, :1])
-            y_over_a = lfilter([1.0], self._a, lfilter(self._b, [1.0], move))
-            for db, da in zip(*self._slopes, strict=True):
+            move = lfilter([1.0], a, p - p[:, :1])
+            y_over_a = lfilter([1.0], a, lfilter(b, [1.0], move))
+            for db, da in zip(*self._family.slopes(self._xi), strict=True):
                 column = lfilter(db, [1.0], move) - lfilter(da, [1.0], y_over_a)
                 columns.append(self._averaged(column)[:, None])
         stack = self._without_common(np.concatenate(columns, axis=1))
-        y = np.broadcast_to(self._y, (len(g), 1, self._rows))
+        y = np.broadcast_to(self._y, (len(g), 1, len(self._y)))
         r = _triangles(np.concatenate([stack, y], axis=1).transpose(0, 2, 1))
         noise = np.sqrt((r[:, -1, -1] ** 2 + self._nominal**2) / self._freedom)
         m = np.abs(r[:, 0, -1] / r[:, 0, 0]) + 1e-30
         # p0 is anywhere within the gap.
-        prior = np.zeros((len(r), 1, r.shape[2]))
-        prior[:, 0, 1] = of_begin = noise * 12.0**0.5 / (m * g)
-        r = _triangles(np.concatenate([r, prior], axis=1))
+        of_begin = noise * 12.0**0.5 / (m * g)
+        r = _triangles(np.concatenate([r, of_begin[:, None, None] * np.eye(1, r.shape[2], 1)], 1))
         off = r[:, 1, -1] / r[:, 1, 1]
         slope = (r[:, 0, -1] - r[:, 0, 1] * off) / r[:, 0, 0]
         p0 = np.clip(begins + off / slope, self._v[0], self._v[0] + g)
         volume = np.log(of_begin / np.abs(r[:, 1, 1]))
-        best = (self._weighed(r, noise, np.abs(slope)) + volume).reshape(len(gaps), -1)
+        best = (self._weighed(r, noise / (np.abs(slope) + 1e-30)) + volume).reshape(len(gaps), -1)
         at = best.argmax(axis=1) + np.arange(len(gaps)) * len(shares)
         return [
             Hypothesis(float(best.ravel()[i]), float(g[i]), float(p0[i]), float(slope[i]))
             for i in at
         ]
 
-    def _weighed(self, r: Array, noise: Array, m: Array) -> Array:
-        """Evidence (H,) from triangles (H, K + 3, K + 3), at the best scale of the error of G."""
-        k, freedom = self._family.count, self._freedom
+    def _weighed(self, r: Array, noise: Array) -> Array:
+        """Evidence (H,) from triangles (H, K + 3, K + 3), at the best scale of the error of G.
+
+        noise: over m (H,).
+        """
+        k = self._family.count
         if not k:
-            left = r[:, -1, -1] ** 2 + self._nominal**2
-            return np.asarray(-0.5 * freedom * np.log(left / self._rows))
-        best = np.full(len(r), -np.inf)
-        i = np.arange(k)
+            return self._value(r[:, -1, -1] ** 2)
+        values = []
         for scale in (0.03, 0.3, 1.0):  # of the error of G that are weighed
-            weight = noise / (scale * m + 1e-30)
-            prior = np.zeros((len(r), k, k + 3))
-            prior[:, i, i + 2] = weight[:, None]
+            prior = (noise / scale)[:, None, None] * np.eye(k, k + 3, 2)
             s = _triangles(np.concatenate([r, prior], axis=1))
-            value = -0.5 * freedom * np.log((s[:, -1, -1] ** 2 + self._nominal**2) / self._rows)
-            value += k * np.log(weight) - 0.5 * scale**2
-            value -= np.log(np.abs(s[:, i + 2, i + 2]) + 1e-300).sum(axis=1)
-            best = np.maximum(best, value)
-        return best
+            volume = np.log(np.abs(np.diagonal(s, 0, 1, 2)[:, 2:-1]) + 1e-300).sum(axis=1)
+            values.append(self._value(s[:, -1, -1] ** 2) + k * np.log(noise / scale)
+                          - 0.5 * scale**2 - volume)
+        return np.asarray(np.max(values, axis=0))
 
 
 def _triangles(stacks: Array) -> Array:

@@ -1,6 +1,6 @@
 """What the estimator is tuned by: every constant with its meaning and unit.
 
-Guards against rounding stand where they are used.
+What is used once, as part of one formula, stands there by name; so do guards against rounding.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ LOST_MOTION = 0.02  # by which the gap of a gear differs from one motion to anot
 
 # --- when an explanation counts
 CHANCE = 1e-3  # probability below which a difference between two estimates is no chance
+BY_CHANCE = 3.0  # standard deviations by which an estimate may lie beyond a bound
+FAR_BEHIND = 30.0  # log-likelihood by which a candidate, or no walk of u, is given up
 ENGAGED = 15.0  # log-likelihood by which a backlash must beat a constant u
 GATE = 6.0  # standard deviations beyond which a reading is an outlier
 OUTLIERS = 5  # readings in a row beyond the gate that are no outliers
@@ -28,6 +30,7 @@ LASTING = 8.0  # times what it had to predict, over which an explanation holds f
 
 # --- how much is looked at
 FIRST_FIT = 20  # samples before the first search
+SHORT_RECORD = 400  # samples of a record in which other gaps are looked for again
 GROWTH = 1.25  # of the record from one search to the next
 SEARCHED = 2.0  # of one of many reversals that a search has not explained
 BLOCKS = 16  # refits while the record doubles: one for so many of its samples
@@ -35,4 +38,4 @@ FEWEST = 8  # samples between two refits
 LIVELY = 1500  # samples that are kept though fewer hold enough reversals
 HELD_REVERSALS = 6  # reversals that the record holds, however long they take
 LONGEST = 120_000  # samples of the record, at most
-ROWS = 1500  # rows that a search averages the record to
+ROWS = 1500  # rows that a search averages the record to, samples that tell the state of a G

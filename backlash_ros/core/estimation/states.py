@@ -12,8 +12,8 @@
 |           |                             |                      | SEARCHING: nothing does for |
 |           |                             |                      | as long as a search looks   |
 
-What was known before the run (`Inherited`) is joined with what the samples say as long as they
-agree; where they contradict it, and are precise on their own, it is dropped.
+What was known before the run is joined with what the samples say as long as they agree; where they
+contradict it, and are precise on their own, it is dropped.
 """
 
 from __future__ import annotations
@@ -25,8 +25,15 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.estimation import settings
-from backlash_ros.core.estimation.belief import Belief, State, excess, published, shortened
-from backlash_ros.core.estimation.coasting import coasts
+from backlash_ros.core.estimation.belief import (
+    Belief,
+    Kept,
+    State,
+    Trial,
+    excess,
+    published,
+    shortened,
+)
 from backlash_ros.core.estimation.explanations import (
     Setup,
     Window,
@@ -42,25 +49,22 @@ from backlash_ros.core.estimation.explanations import (
     with_walk,
 )
 from backlash_ros.core.estimation.fit import FEW_STEPS, Problem
-from backlash_ros.core.estimation.late_commands import likelier
-from backlash_ros.core.estimation.play import engaged, play, reversals
 from backlash_ros.core.estimation.posterior import WindowFit
-from backlash_ros.core.estimation.settings import FEWEST, MISFIT, PREDICTED
+from backlash_ros.core.estimation.score_tests import coasts, likelier
+from backlash_ros.core.estimation.settings import FEWEST, MISFIT, PREDICTED, SHORT_RECORD
 
 Array = NDArray[np.float64]
 
-SHORT_SEARCH = 400  # samples of a record in which other gaps are looked for again
-
 
 def learn(setup: Setup, record: Window, before: Belief) -> Belief:
-    """What is believed with the samples of this record, which begins at `before.first`.
+    """What is believed with the samples of this record, which begins at `before.kept.first`.
 
     Raises nothing: where the numbers get too large, it begins anew with the newest samples.
     """
     look = {State.SEARCHING: _searching, State.KNOWN: _known, State.DOUBTED: _doubted}
     try:
         with np.errstate(all='ignore'):
-            return look[before.state](setup, record.without(before.rejected), before)
+            return look[before.state](setup, record.without(before.kept.rejected), before)
     except np.linalg.LinAlgError:
         first = max(record.end - settings.FIRST_FIT, record.first)
         return _begun_anew(before, first, record.end, record.end + FEWEST)
@@ -68,10 +72,10 @@ def learn(setup: Setup, record: Window, before: Belief) -> Belief:
 
 def _begun_anew(before: Belief, first: int, end: int, next_at: int) -> Belief:
     """Nothing is known of the samples; what was published stays."""
-    reason = Status.INCONSISTENT if before.fit is not None else before.reason
     return replace(
-        before, state=State.SEARCHING, reason=reason, fit=None, first=first, end=end,
-        next_at=next_at, older=None, start=None, candidate=None, doubt_from=None,
+        before, reason=before.reason if before.fit is None else Status.INCONSISTENT, fit=None,
+        found=None, doubt_from=None, end=end, next_at=next_at,
+        kept=before.kept._replace(first=first, older=None, start=None),
     )
 
 
@@ -80,47 +84,49 @@ def _begun_anew(before: Belief, first: int, end: int, next_at: int) -> Belief:
 
 def _searching(setup: Setup, record: Window, before: Belief) -> Belief:
     shortest = 50  # samples of a part of a record that is searched alone
-    count, tried = len(record.v), before.tried
+    count, tried = len(record.v), before.found
     soon = record.end + max(count // settings.BLOCKS, FEWEST)
+    known_once = tried is not None and is_known(setup, tried, tried.left.turns)
+    if tried is not None and not known_once and record.end < before.thorough_at \
+            and not is_known(setup, tried, record.turns(max(tried.gap, 0.0), tried.p0)):
+        return replace(before, end=record.end, next_at=soon)
     # What many reversals do not tell, a few more will not.
-    lasting = tried is not None and tried.turns >= settings.HELD_REVERSALS
+    lasting = tried is not None and tried.left.turns >= settings.HELD_REVERSALS
     growth = settings.SEARCHED if lasting else settings.GROWTH
     search_at = record.end + max(int(count * (growth - 1.0)), FEWEST)
-    after = replace(before, end=record.end, next_at=search_at, thorough_at=search_at)
-    if tried is not None and before.candidate is None and record.end < before.thorough_at \
-            and not is_known(setup, tried, _turns(record, max(tried.gap, 0.0), tried.p0)):
-        return replace(after, next_at=soon, thorough_at=before.thorough_at)
-    found = afresh(setup, record, also=before.candidate or before.tried, walks=True)
+    found = afresh(setup, record, also=tried, walks=True)
     part = shorter = record
     why = _why(setup, found, record, before)
     while why in (Status.INCONSISTENT, Status.NOT_EXCITED) and len(shorter.v) >= 3 * shortest:
         # What happened at its beginning may have spoilt a record.
         shorter = shorter.between(shorter.end - len(shorter.v) // 3)
         newest = afresh(setup, shorter)
-        if newest is not None and is_known(setup, newest, newest.turns):
+        if newest is not None and is_known(setup, newest, newest.left.turns):
             found, part = newest, shorter
             break
+    after = replace(before, end=record.end, next_at=search_at, thorough_at=search_at,
+                    found=None, reason=why, coasts=False)
     if found is None:
-        return replace(after, tried=None, reason=why, coasts=False, candidate=None)
-    found, swapped = _with_commands(setup, part, found, before.swapped)
-    runs_on = found.m > 0.0 and _leaves_more(setup, found) \
-        and coasts(problem_of(setup, part), found, before.published)
+        return after
+    found, swapped = _with_commands(setup, part, found, before.kept.swapped)
+    runs_on = found.m > 0.0 and _leaves_more(setup, found) and coasts(
+        problem_of(setup, part), found, before.published and before.published.crossings)
     after = replace(
-        after, swapped=swapped, tried=found, coasts=runs_on,
+        after, kept=before.kept._replace(swapped=swapped), found=found, coasts=runs_on,
         reason=Status.INCONSISTENT if runs_on else why,
     )
-    if not is_known(setup, found, found.turns):
-        if is_known(setup, found, settings.REVERSALS):  # but for a reversal, which may come soon
-            after = replace(after, next_at=soon)
-        return replace(after, candidate=None)
-    if before.candidate is None or not alike(before.candidate, found):
+    if not is_known(setup, found, found.left.turns):
+        # But for a reversal, which may come soon?
+        return replace(after, next_at=soon) if is_known(setup, found, settings.REVERSALS) else after
+    if tried is None or not known_once or not alike(tried, found):
         # A first estimate has to be found twice: some samples alone may mislead.
-        return replace(after, candidate=found, next_at=soon)
+        return replace(after, next_at=soon)
     # What leaves more than noise must predict a quarter as many samples before it is believed.
     more = found.systematic or noisier(setup, found)
-    must = max(before.must_predict, len(part.v) // 4 if more else 0)
-    after = replace(after, older=None, start=None, must_predict=must)
-    return _adopted(setup, part, found, after)
+    must = max(before.trial.must, len(part.v) // 4 if more else 0)
+    return _adopted(setup, part, found, replace(
+        after, kept=after.kept._replace(older=None, start=None),
+        trial=before.trial._replace(must=must)))
 
 
 def _with_commands(
@@ -146,22 +152,17 @@ def _why(setup: Setup, found: WindowFit | None, record: Window, before: Belief) 
     """What to say while nothing is known."""
     if len(record.v) < 100 and before.reason is Status.ACQUIRING:
         return Status.ACQUIRING
-    known = before.published
     if found is None:
-        crosses = known is not None and np.ptp(record.v) > known[1] - known[2]
+        known = before.published
+        crosses = known and np.ptp(record.v) > known.crossings[1] - known.crossings[2]
         return Status.INCONSISTENT if crosses else Status.NOT_EXCITED
     # Until v has swung past the gap a fit may have none: the gap of the first guess counts then.
     gap = max(found.gap, setup.guess)
-    turns = _turns(record, gap, float(record.v[0]))
     large = found.unexplained * found.gap > settings.UNEXPLAINED * gap \
-        or turns >= settings.HELD_REVERSALS
+        or record.turns(gap, float(record.v[0])) >= settings.HELD_REVERSALS
     wrong = found.m < 0.0 or (large and _leaves_more(setup, found))
-    contradicts = known is not None and is_known(setup, found, found.turns)
+    contradicts = before.published and is_known(setup, found, found.left.turns)
     return Status.INCONSISTENT if wrong or contradicts else Status.ACQUIRING
-
-
-def _turns(record: Window, gap: float, p0: float) -> int:
-    return len(reversals(engaged(record.v, play(record.v, gap, p0), gap)))
 
 
 def _leaves_more(setup: Setup, found: WindowFit) -> bool:
@@ -171,15 +172,15 @@ def _leaves_more(setup: Setup, found: WindowFit) -> bool:
 
 def _adopted(setup: Setup, record: Window, fit: WindowFit, before: Belief) -> Belief:
     """The fit of this record is what is believed."""
-    count, must = len(record.v), before.must_predict
+    count, must = len(record.v), before.trial.must
     another_noise = before.published is None or fit.walk_std > 0.0
     if before.fit is not None and another_noise and alike(fit, before.fit):
         must = min(must, PREDICTED)  # another noise, or a walk, but not another backlash
     return published(setup, replace(
-        before, state=State.KNOWN, must_predict=must, fit=fit, first=record.first, end=record.end,
-        candidate=None, tried=None, doubt_from=None,
+        before, fit=fit, found=None, doubt_from=None, end=record.end,
+        kept=before.kept._replace(first=record.first), trial=Trial(must, 0, fit.noise),
         next_at=record.end + max(count // settings.BLOCKS, FEWEST),
-        thorough_at=record.end + count // 4, predicted=0, adopted_noise=fit.noise,
+        thorough_at=record.end + count // 4,
     ))
 
 
@@ -187,48 +188,49 @@ def _adopted(setup: Setup, record: Window, fit: WindowFit, before: Belief) -> Be
 
 
 def _known(setup: Setup, record: Window, before: Belief) -> Belief:
-    held = before.fit
+    held, trial, kept = before.fit, before.trial, before.kept
     assert held is not None
     count, new = len(record.v), before.end - record.first
     problem = before.problem(setup, record)
     fit = problem.fitted(held, FEW_STEPS)
     since = before.end - setup.family.memory
-    record, others = likelier(problem, fit, record, since, before.swapped)
-    if others != before.swapped:
-        before = replace(before, swapped=others)
+    record, others = likelier(problem, fit, record, since, kept.swapped)
+    if others != kept.swapped:
+        kept = kept._replace(swapped=others)
         problem = before.problem(setup, record)
         fit = problem.fitted(fit, FEW_STEPS)
-    z = problem.residual(fit)[new:] / held.noise
-    wild = outliers(z)
+    wild = outliers(problem.residual(fit)[new:] / held.noise)
     if wild.any():
         numbers = frozenset((record.first + new + np.flatnonzero(wild)).tolist())
-        cleaned = replace(before, rejected=before.rejected | numbers)
+        cleaned = replace(before, kept=kept._replace(rejected=kept.rejected | numbers))
         return _known(setup, record.without(numbers), cleaned)
     # What was known before the run is not to be moved by samples that the fit does not explain.
-    rho = held.correlation if before.inherited is None else 0.0
+    rho = held.left.correlation if before.inherited is None else 0.0
     if _contradicts(problem, held, fit, new, rho):
         fit = problem.fitted(held)  # before anything is blamed
-    grown = before.on_probation and fit.noise > settings.AS_GOOD * before.adopted_noise
+    grown = trial.lasts and fit.noise > settings.AS_GOOD * trial.noise
     if grown or _contradicts(problem, held, fit, new, rho):
         beyond = np.nan_to_num((problem.residual(held)[new:] / held.noise) ** 2 - MISFIT)
         change = int(np.argmax(np.cumsum(beyond[::-1])[::-1]))
         return replace(
-            before, state=State.DOUBTED, end=record.end, candidate=None,
+            before, end=record.end, found=None, kept=kept, trial=trial.next,
             doubt_from=record.first + new + change, next_at=record.end + FEWEST,
-            must_predict=before.must_predict_next,
-            reason=Status.INCONSISTENT if before.on_probation else before.reason,
+            reason=Status.INCONSISTENT if trial.lasts else before.reason,
         )
     after = replace(
         before, end=record.end, next_at=record.end + max(count // settings.BLOCKS, FEWEST),
-        predicted=before.predicted + count - new,
+        kept=kept, trial=trial._replace(predicted=trial.predicted + count - new),
     )
     if record.end >= before.thorough_at:
         after = replace(after, thorough_at=record.end + 2 * count // 5)
-        short = count <= SHORT_SEARCH and before.older is None
         fit = with_intervals(problem, fit)
         if fit.spread.any():  # else it has been normal for long
             fit = replace(fit, spread=spread(problem, fit))
-        fit = _beside_others(setup, record, problem, fit) if short else fit
+        if count <= SHORT_RECORD and kept.older is None:
+            other = afresh(setup, record)
+            if other is not None and is_known(setup, other, settings.REVERSALS):
+                best = other if other.evidence > fit.evidence + 3.0 else fit
+                fit = replace(best, spread=spread(problem, best, [fit, other]))
         fit = with_walk(setup, problem, fit)
     else:
         fit = problem.finished(fit)
@@ -239,15 +241,6 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
     after = published(setup, after)
     wrong = after.reason is Status.INCONSISTENT
     return replace(after, coasts=wrong and coasts(problem, fit))
-
-
-def _beside_others(setup: Setup, record: Window, problem: Problem, fit: WindowFit) -> WindowFit:
-    """The fit of a short record, or another one that is likelier, mixed with each other."""
-    other = afresh(setup, record)
-    if other is None or not is_known(setup, other, settings.REVERSALS):
-        return fit
-    best = other if other.evidence > fit.evidence + 3.0 else fit
-    return replace(best, spread=spread(problem, best, [fit, other]))
 
 
 def _contradicts(
@@ -264,10 +257,8 @@ def _contradicts(
     weights, z = weights[new:], z[new:]
     seen = np.isfinite(z)
     count = float(weights[seen].sum())
-    if not count:
-        return False
     wild = np.abs(z) > settings.GATE
-    mean = float(np.nansum(weights * np.where(wild, 0.0, z**2))) / count
+    mean = float(np.nansum(weights * np.where(wild, 0.0, z**2))) / max(count, 1e-300)
     return mean > _most(MISFIT, count, rho) \
         or float(wild.sum()) > settings.OUTLIER_SHARE * int(seen.sum())
 
@@ -285,44 +276,46 @@ def _most(least: float, count: float, rho: float) -> float:
 
 def _doubted(setup: Setup, record: Window, before: Belief) -> Belief:
     """The samples since the doubt: over, another backlash, or nothing that explains them."""
-    held, since = before.fit, before.doubt_from
+    held, since, kept = before.fit, before.doubt_from, before.kept
     assert held is not None
     assert since is not None
     count, newer = len(record.v), record.end - since
-    after = replace(before, end=record.end, candidate=None,
+    after = replace(before, end=record.end, found=None,
                     next_at=record.end + max(newer // 4, FEWEST))
     z = before.problem(setup, record).residual(held) / held.noise
     if newer >= 2 * PREDICTED and np.nanmean(z[-PREDICTED:] ** 2) < MISFIT:
         # Whatever it was, it is over: what was measured meanwhile says nothing.
         lost = frozenset(range(since, record.end - PREDICTED))
         return replace(
-            after, state=State.KNOWN, doubt_from=None, rejected=before.rejected | lost,
+            after, doubt_from=None, kept=kept._replace(rejected=kept.rejected | lost),
             end=record.end - 1, next_at=record.end,
         )
     if newer >= PREDICTED:
         after = replace(after, reason=Status.INCONSISTENT)
-    short = max(SHORT_SEARCH, 4 * setup.family.memory)
+    short = max(SHORT_RECORD, 4 * setup.family.memory)
     explained = settings.AS_GOOD * held.noise
     whole = None
     if count <= max(short, 4 * newer) and count < settings.LONGEST:
         whole = afresh(setup, record, walks=newer >= 2 * PREDICTED)
-        if whole is not None and not whole.rms < explained:
+        if whole is not None and not whole.left.rms < explained:
             whole = None
     for first in (since, (since + record.end) // 2):
         part = record.between(first)
         found = afresh(setup, part, like=held) if len(part.v) >= PREDICTED else None
-        if found is None or found.rms > explained \
-                or not is_known(setup, found, found.turns + (setup.family.count > 0)):
+        if found is None or found.left.rms > explained \
+                or not is_known(setup, found, found.left.turns + (setup.family.count > 0)):
             continue
         apart = held.evidence + found.evidence - 0.5 * (4 + len(held.x)) * np.log(len(part.v))
         if whole is not None and whole.evidence > apart:
             break
-        if before.candidate is None or not alike(before.candidate, found):
-            return replace(after, candidate=found)
-        return _adopted(setup, part, found, replace(after, older=of_xi(held), start=None))
-    if whole is not None and is_known(setup, whole, whole.turns):
-        return _adopted(setup, record, whole, replace(after, older=None, start=None))
+        if before.found is None or not alike(before.found, found):
+            return replace(after, found=found)
+        return _adopted(setup, part, found, replace(
+            after, kept=Kept(0, of_xi(held), None, kept.rejected, kept.swapped)))
+    if whole is not None and is_known(setup, whole, whole.left.turns):
+        return _adopted(setup, record, whole, replace(
+            after, kept=kept._replace(older=None, start=None)))
     # Two reversals of the record take so long, on average.
-    if newer > max(short, 2 * count // max(held.turns, 1)):
+    if newer > max(short, 2 * count // max(held.left.turns, 1)):
         return _begun_anew(after, since, record.end, record.end + 1)
     return after

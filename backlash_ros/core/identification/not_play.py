@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.play import play, plays
+from backlash_ros.core.plant.backlash import play
 from backlash_ros.core.plant.numerics import lfilter
 
 Array = NDArray[np.float64]
@@ -223,7 +223,7 @@ def _leading(v: Array, width: float) -> Array:
 def _many(v: Array, widest: float, share: float) -> Array:
     """Plays of all widths up to the widest in parallel, and a share of v itself beside them."""
     widths = abs(widest) * np.linspace(0.04, 0.96, 12, dtype=np.float64)
-    held = plays(v, widths, v[0] + 0.5 * widths) - 0.5 * widths[:, None]
+    held = play(v, widths, v[0] + 0.5 * widths) - 0.5 * widths[:, None]
     share = min(max(share, 0.0), 1.0)
     return np.asarray(share * v + (1.0 - share) * held.mean(axis=0))
 

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.fit import STEPS, Problem
 from backlash_ros.core.estimation.plant_family import padded, state_columns
-from backlash_ros.core.estimation.play import play
 from backlash_ros.core.estimation.posterior import Prior, WindowFit
+from backlash_ros.core.plant.backlash import play
 from backlash_ros.core.plant.numerics import lfilter
 
 Array = NDArray[np.float64]

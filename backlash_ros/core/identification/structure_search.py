@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.fit import FEW_STEPS, FIRST_STEPS
-from backlash_ros.core.estimation.reading import step_of
+from backlash_ros.core.estimation.posterior import step_of
 from backlash_ros.core.estimation.search import search
 from backlash_ros.core.estimation.settings import ROWS
 from backlash_ros.core.identification.deviations import by_model, effective

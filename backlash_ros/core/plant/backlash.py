@@ -1,9 +1,19 @@
-"""Backlash, equation (2.1): play between an actuator and what it drives."""
+"""Backlash, equation (2.1): play between an actuator and what it drives; also over a record.
+
+u = m (p - c_r) of a play p(k) = min(max(p(k-1), v(k)), v(k) + gap) with gap = c_r - c_l: p rests on
+v while the right side is engaged, and on v + gap while the left one is.
+"""
 
 from enum import IntEnum
 from math import isfinite
 
+import numpy as np
+from numpy.typing import NDArray
+
 from backlash_ros.core.parameters.errors import ParameterError
+
+Array = NDArray[np.float64]
+Sides = NDArray[np.int8]
 
 
 class Region(IntEnum):
@@ -47,3 +57,39 @@ class Backlash:
         self.region = Region.RIGHT if self.u == upward else \
             Region.LEFT if self.u == downward else Region.GAP
         return self.u
+
+
+# --- over a record ------------------------------------------------------------------------------
+
+
+def play(v: Array, gap: Array | float, before: Array | float) -> Array:
+    """p after each v (N,); before: p before the first. For gaps (H,) and beginnings (H,): (H, N).
+
+    Between two turns of v, p is the larger of v and what was held, or the smaller of v + gap and
+    it: only the turns are stepped.
+    """
+    rises = np.append(False, v[1:] > v[:-1])
+    turns = np.append(np.flatnonzero(rises[1:] != rises[:-1]), len(v) - 1)
+    many = isinstance(gap, np.ndarray)
+    lower, upper = (np.minimum, np.maximum) if many else (min, max)
+    first = float(v[0])
+    held, at_turns = lower(upper(before, first), first + gap), []
+    for value, rising in zip(v[turns].tolist(), rises[turns].tolist(), strict=True):
+        at_turns.append(held)
+        held = upper(held, value) if rising else lower(held, value + gap)
+    p = np.repeat(np.array(at_turns).T, np.diff(turns, prepend=-1), axis=-1)
+    wide = gap[:, None] if isinstance(gap, np.ndarray) else gap
+    return np.where(rises, np.maximum(p, v), np.minimum(p, v + wide))
+
+
+def engaged(v: Array, p: Array, gap: float) -> Sides:
+    """The Region of the side that was engaged last at each sample (N,): GAP before the first."""
+    now = np.where(p == v, Region.RIGHT, np.where(p == v + gap, Region.LEFT, Region.GAP))
+    newest = np.maximum.accumulate(np.where(now != Region.GAP, np.arange(len(v)), -1))
+    return np.where(newest < 0, Region.GAP, now[newest]).astype(np.int8)
+
+
+def reversals(sides: Sides) -> NDArray[np.intp]:
+    """Samples (R,) at which the other side engages."""
+    seen = np.flatnonzero(sides)
+    return np.asarray(seen[1:][np.diff(sides[seen]) != 0])

@@ -49,9 +49,9 @@ def test_backlash_and_noise_are_found(seed: int) -> None:
     fit = of(*record(500, truth, seed=seed), 0.2 * (seed % 2))
     assert_is(fit, truth)
     assert fit.fit.noise == pytest.approx(NOISE, rel=0.25)
-    assert fit.fit.rms == pytest.approx(NOISE, rel=0.25)
+    assert fit.fit.left.rms == pytest.approx(NOISE, rel=0.25)
     assert fit.predicted > 0.9
-    assert fit.fit.correlation == 0.0
+    assert fit.fit.left.correlation == 0.0
     assert fit.delay == 0
 
 

@@ -46,5 +46,5 @@ def test_dead_time_and_another_frequency_are_among_them(omega_t: float, lag: flo
         off = family.model_at(xi.tolist()).response(z) - true.response(z)
         return np.concatenate([off.real, off.imag])
 
-    begins = [[(lag + by) / family._scales[0], 0.0, 0.0, 0.0] for by in (-0.2, 0.1, 0.2)]
+    begins = [[(lag + by) / family._scales[0][0], 0.0, 0.0, 0.0] for by in (-0.2, 0.1, 0.2)]
     assert min(abs(least_squares(apart, begin).fun).max() for begin in begins) < 1e-6

@@ -6,8 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from backlash_ros.core.estimation.play import play, plays
-from backlash_ros.core.plant.backlash import clamp
+from backlash_ros.core.plant.backlash import clamp, play
 
 values = st.floats(-10.0, 10.0)
 
@@ -20,4 +19,4 @@ def test_stepping_the_turns_alone_leaves_nothing_out(v, gaps, before):
         for gap in gaps
     ]
     assert play(np.array(v), gaps[0], before).tolist() == stepped[0]
-    assert plays(np.array(v), np.array(gaps), np.full(len(gaps), before)).tolist() == stepped
+    assert play(np.array(v), np.array(gaps), np.full(len(gaps), before)).tolist() == stepped

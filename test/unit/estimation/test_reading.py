@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from backlash_ros.core.estimation.reading import independence, likelihood, mean_information
+from backlash_ros.core.estimation.posterior import independence, likelihood, mean_information
 
 APART = 1e-3
 R = APART * np.arange(-12_000, 12_001)

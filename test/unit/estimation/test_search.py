@@ -3,8 +3,8 @@
 import numpy as np
 
 from backlash_ros.core.estimation.plant_family import PlantFamily
-from backlash_ros.core.estimation.play import play
 from backlash_ros.core.estimation.search import search
+from backlash_ros.core.plant.backlash import play
 from backlash_ros.core.plant.numerics import lfilter
 from backlash_ros.core.plant.transfer_function import TransferFunction
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from backlash_ros.core.estimation.play import play
 from backlash_ros.core.identification.deviations import by_model, covariance_of
 from backlash_ros.core.identification.structure import Samples, Structure, first_model, fitted
+from backlash_ros.core.plant.backlash import play
 
 
 def std_of_gap(noise: np.ndarray) -> tuple[float, float]:

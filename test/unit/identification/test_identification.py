@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from backlash_ros.core.estimation.play import play
 from backlash_ros.core.identification.identification import identify
 from backlash_ros.core.identification.motion import strokes
 from backlash_ros.core.identification.result import Identification, Options
 from backlash_ros.core.identification.structure import Samples, Structure, first_model, fitted
+from backlash_ros.core.plant.backlash import play
 
 Array = NDArray[np.float64]
 PERIOD_S = 0.005

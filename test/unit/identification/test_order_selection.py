@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from backlash_ros.core.estimation.play import play
 from backlash_ros.core.estimation.posterior import WindowFit
 from backlash_ros.core.identification.identification import identify
 from backlash_ros.core.identification.motion import strokes
@@ -19,6 +18,7 @@ from backlash_ros.core.identification.order_selection import (
 )
 from backlash_ros.core.identification.result import Options
 from backlash_ros.core.identification.structure import Model, Samples, Structure
+from backlash_ros.core.plant.backlash import play
 
 SAMPLES = Samples(np.zeros(2), np.full(2, np.nan), 1, 2, 0.0)
 

@@ -25,8 +25,8 @@ ROOMS = (
     'identification', 'driver_check',
 )
 ESTIMATION = (
-    'settings', 'plant_family', 'play', 'reading', 'posterior', 'fit', 'search',
-    'explanations', 'late_commands', 'coasting', 'belief', 'states', 'observer', 'estimator',
+    'settings', 'plant_family', 'posterior', 'fit', 'search', 'explanations', 'score_tests',
+    'belief', 'states', 'observer', 'estimator',
 )
 NUMERIC = {'numpy', 'scipy'}
 ROS_SUFFIXES = ('_msgs', '_srvs', '_interfaces')

@@ -1,0 +1,125 @@
+"""What a fit lacks, told from its residuals alone: a load that coasts, commands that were late.
+
+A load that nothing holds in the gap runs on with the speed that it had when it left its side, as
+far as the other side. That is one more column of the fit; its coefficient kappa is 0 where the load
+stays and 1 where nothing brakes it (C. R. Rao, Proc. Cambridge Philosophical Society 44 (1948)).
+
+Where the time of arrival leaves open which of two commands acted over an interval, the other one
+would add s to y, until the play output is the same again. With s in the residuals r, it is
+
+    (s.r - s.s / 2) / sigma^2
+
+more likely, less the log-odds against it; of both r and s, what other unknowns may explain is left
+out. The likeliest is believed first, and the rest compared again, until none is likely. How often
+commands are late is unknown: with Jeffreys' prior of that share, k of n that were late make the
+odds of one more (k + 1/2) to (n - k - 1/2) (A. S. Willsky, H. L. Jones, A generalized likelihood
+ratio approach to the detection and estimation of jumps, IEEE Trans. Automatic Control 21 (1976)).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import log, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.estimation.explanations import Window
+from backlash_ros.core.estimation.fit import Problem
+from backlash_ros.core.estimation.posterior import WindowFit
+from backlash_ros.core.plant.backlash import clamp, play
+from backlash_ros.core.plant.model_check import ON_CIRCLE
+from backlash_ros.core.plant.numerics import lfilter
+from backlash_ros.core.plant.transfer_function import memory_of
+
+Array = NDArray[np.float64]
+
+
+def coasts(problem: Problem, fit: WindowFit, known: Array | None = None) -> bool:
+    """Whether the load runs on within the gap: that of the fit, or the one known before.
+
+    known: m, c_r, c_l (3,). The fit of a load that coasts may have next to no gap.
+    """
+    if known is not None:
+        m, c_r, c_l = known.tolist()
+        theta = np.concatenate([[m, m * c_r, c_r - c_l], fit.theta[3:]])
+        there = problem.begun(replace(
+            fit, theta=theta, p0=float(problem.v[0]) + 0.5 * (c_r - c_l)))
+        if coasts(problem, problem.finished(there)):
+            return True
+    v, p = problem.v, problem.input(fit)[0]
+    beyond = [0.0]  # how far a load that nothing brakes is from p
+    speed = 0.0
+    for k, move in enumerate(np.diff(p).tolist(), 1):
+        speed = move or speed
+        # From one side, where it starts anew, to the other.
+        away = 0.0 if move else clamp(beyond[-1] + speed, v[k] - p[k], v[k] + fit.gap - p[k])
+        beyond.append(away)
+    b, a = problem.family.at(fit.xi)
+    column = lfilter(b, a, fit.m * np.array(beyond))[problem.known]
+    q = _basis(problem.jacobian(fit)[problem.known])
+    s = column - q @ (q.T @ column)
+    squares = float(s @ s)
+    if squares <= 1e-12 * float(column @ column):
+        return False
+    kappa = float(s @ problem.residual(fit)[problem.known]) / squares
+    # Over its standard deviation as if residuals were white: they are far from that.
+    return kappa > 0.15 and kappa * squares**0.5 / max(fit.noise, fit.left.rms) > 8.0
+
+
+def likelier(problem: Problem, fit: WindowFit, record: Window, since: int, back: frozenset[int],
+             ) -> tuple[Window, frozenset[int]]:
+    """The record as it is likelier from `since` on, and where in it the other command acted.
+
+    problem: of the record. back: numbers of the samples over which the other one acts already, so
+    that its odds are the reverse.
+    """
+    own_noise = 0.25  # of correlated residuals: what is noise of readings
+    open_ = np.flatnonzero(np.isfinite(record.other))
+    count, late = len(open_), len(record.places(back))
+    open_ = open_[open_ >= since - record.first]
+    if not len(open_) or fit.m <= 0.0:
+        return record, back
+    b, a = problem.family.at(fit.xi)
+    modes = np.abs(np.roots(a))
+    reach = memory_of(float(modes[modes < 1.0 - ON_CIRCLE].max(initial=0.0)))
+    known = problem.known.astype(np.float64)
+    q = _basis(problem.jacobian(fit) * known[:, None])
+    residual = (problem.y - problem.output(fit)) * known
+    # Correlated residuals are for the most part made by the commands that are looked for.
+    noise = fit.noise * (own_noise if fit.systematic else 1.0)
+    noise = max(noise, problem.nominal, problem.step_of_readings / sqrt(12.0))
+    v, other = record.v.copy(), record.other.copy()
+    chosen: set[int] = set()
+    for _ in range(200):  # swaps of one look
+        p = play(v, fit.gap, fit.p0)
+        more, less = (log(max(count - k, 1) - 0.5) - log(k + 0.5) for k in (late, max(late - 1, 0)))
+        rest = residual - q @ (q.T @ residual)
+        best, place, change = 0.0, -1, rest
+        for k in open_.tolist():
+            acting = v[k:k + reach].copy()
+            acting[0] = other[k]
+            moved = play(acting, fit.gap, float(p[k - 1]) if k else fit.p0) - p[k:k + reach]
+            if moved.any():
+                s = lfilter(b, a, fit.m * moved)
+                end = k + len(s)
+                seen = s * known[k:end]
+                explained = q[k:end].T @ seen
+                gain = float(seen @ rest[k:end] - 0.5 * (seen @ seen - explained @ explained))
+                gain /= noise**2
+                gain -= more if (record.first + k in back) == (k in chosen) else -less
+                if gain > best:
+                    best, place, change = gain, k, seen
+        if place < 0:
+            break
+        late += 1 if (record.first + place in back) == (place in chosen) else -1
+        v[place], other[place] = other[place], v[place]
+        chosen ^= {place}
+        residual[place:place + len(change)] -= change
+    found = frozenset(record.first + k for k in chosen)
+    return record.swapped(found), back ^ found
+
+
+def _basis(columns: Array) -> Array:
+    """Orthonormal columns of the same span (N, P)."""
+    return np.linalg.qr(columns / np.maximum(np.abs(columns).max(axis=0), 1e-300))[0]
