@@ -16,12 +16,6 @@ from backlash_ros.core.parameters.parameter import Value
 from backlash_ros.core.parameters.table import BRINGUP, BY_NAME, PLANT
 from backlash_ros.tools.config import ANY, config_text
 
-# Parameters of the file that the user gave which do not go on: of the simulation, of one run.
-NOT_TAKEN_OVER = (
-    'truth', 'backlash', 'output_noise_std', 'output_quantum', 'input_disturbance', 'estimates',
-    'bag', 'lockstep', 'wait_for_subscribers', 'wait_for_publishers', 'axes',
-)
-
 
 def identified_parameters(
     found: Identification, given: Mapping[str, Value], estimates: Path | None = None,
@@ -31,6 +25,11 @@ def identified_parameters(
     estimates: file of what the controller is to begin with. Raises ParameterError where the
     controller does not take it.
     """
+    # Parameters of the file that the user gave which do not go on: of the simulation, of one run.
+    not_taken_over = (
+        'truth', 'backlash', 'output_noise_std', 'output_quantum', 'input_disturbance', 'estimates',
+        'bag', 'lockstep', 'wait_for_subscribers', 'wait_for_publishers', 'axes',
+    )
     wider = 3.0  # bounds of the estimates, in times of what was found
     assert found.details is not None
     reach = max(abs(found.c_r), abs(found.c_l)) + found.std['c_r']
@@ -49,7 +48,7 @@ def identified_parameters(
         **({'estimator.use_applied_control': 'true'} if lag else {}),
         **(_reference(found, found.details)
            if not {'waveform', 'amplitude', 'frequency', 'bias', 'file'} & set(given) else {}),
-        **{name: value for name, value in given.items() if not name.startswith(NOT_TAKEN_OVER)},
+        **{name: value for name, value in given.items() if not name.startswith(not_taken_over)},
         'sample_period': found.sample_period,
         'plant.numerator': found.numerator,
         'plant.denominator': found.denominator,

@@ -27,9 +27,6 @@ PATTERNS: Mapping[str, Sequence[str]] = {
         r'(.* )?(positions?|pos|output|encoder|angle|theta|q)( .*)?|.* y',
     ),
 }
-# What is neither v nor y, whatever else its name says.
-OTHERS = r'.*\b(qd|dq|speed|velocity|vel|load|current|torque|effort|temp(erature)?|voltage|' \
-         r'status|moving|err(or)?|acceleration|acc|power|rate|direction|duration)\b.*'
 UNITS_S = {
     unit: scale for scale, units in {
         1e-9: 'ns nsec nanoseconds', 1e-6: 'us µs μs usec microseconds micros',
@@ -92,9 +89,12 @@ def unit_of(name: str) -> float | None:
 
 def _fitting(role: str, names: Sequence[str], taken: Mapping[str, str]) -> list[str]:
     """Columns that may be this, of the surest pattern that fits any."""
+    # What is neither v nor y, whatever else its name says.
+    others = r'.*\b(qd|dq|speed|velocity|vel|load|current|torque|effort|temp(erature)?|voltage|' \
+             r'status|moving|err(or)?|acceleration|acc|power|rate|direction|duration)\b.*'
     words = {name: _words(name) for name in names if name not in taken.values()}
     found = ([name for name, text in words.items() if re.fullmatch(pattern, text)
-              and (role == 't' or not re.fullmatch(OTHERS, text))] for pattern in PATTERNS[role])
+              and (role == 't' or not re.fullmatch(others, text))] for pattern in PATTERNS[role])
     return next(filter(None, found), [])
 
 

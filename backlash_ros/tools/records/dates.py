@@ -10,12 +10,6 @@ from math import nan
 import numpy as np
 from numpy.typing import NDArray
 
-# A date, a time of day, or both.
-STAMP = re.compile(
-    r'(?:(?P<a>\d{1,4})(?P<sign>[-/. ])(?P<b>\d{1,2}|[a-z]{3})[a-z]*[-/. ](?P<c>\d{1,4}))?[t ,]*'
-    r'(?:(?:(?P<h>\d{1,4}):)?(?P<m>\d{1,2}):(?P<s>\d{1,2}(?:[.,:]\d+)?)'
-    r'(?: ?(?P<half>[ap])\.?m\.?)?)?', re.IGNORECASE)
-
 
 def times_of(cells: Sequence[str]) -> NDArray[np.float64]:
     """Seconds (N,) of dates, or of times of day; nan for what is none.
@@ -34,7 +28,11 @@ def times_of(cells: Sequence[str]) -> NDArray[np.float64]:
 def _seconds(cell: str, day_first: bool) -> float:
     text = re.sub(r'( ?Z| UTC|[+-]\d\d:?\d\d)$', '', cell.strip())
     text = re.sub(r'^(\d{4})(\d\d)(\d\d)[T_ ](\d\d)(\d\d)(\d\d)', r'\1-\2-\3 \4:\5:\6', text)
-    found = STAMP.fullmatch(text)
+    # A date, a time of day, or both.
+    found = re.fullmatch(
+        r'(?:(?P<a>\d{1,4})(?P<sign>[-/. ])(?P<b>\d{1,2}|[a-z]{3})[a-z]*[-/. ](?P<c>\d{1,4}))?'
+        r'[t ,]*(?:(?:(?P<h>\d{1,4}):)?(?P<m>\d{1,2}):(?P<s>\d{1,2}(?:[.,:]\d+)?)'
+        r'(?: ?(?P<half>[ap])\.?m\.?)?)?', text, re.IGNORECASE)
     if not text or found is None:
         return nan
     part = found.groupdict()

@@ -26,9 +26,6 @@ from backlash_ros.tools.records.dates import times_of
 
 Array = NDArray[np.float64]
 
-NOT_KNOWN = {
-    '', 'nan', 'null', 'none', 'na', 'n/a', '-', '--', 'nil', '?', '#n/a', 'bad', 'missing',
-}
 MOST_BROKEN = 0.1  # share of the lines that may be broken, and of the cells that are no number
 
 
@@ -67,12 +64,14 @@ class Table:
 
     def numbers(self, name: str, what: str = 'number') -> Array:
         """A column as numbers (N,), nan where there is none; raises RecordError."""
+        not_known = {'', 'nan', 'null', 'none', 'na', 'n/a', '-', '--', 'nil', '?', '#n/a', 'bad',
+                     'missing'}
         cells = self.cells[self.names.index(name)]
         if isinstance(cells, np.ndarray):
             return cells
         read = [_number(cell, self.comma) for cell in cells]
         values = np.array([nan if value is None else value for value in read])
-        broken = [k for k in np.flatnonzero(np.isnan(values)) if cells[k].lower() not in NOT_KNOWN]
+        broken = [k for k in np.flatnonzero(np.isnan(values)) if cells[k].lower() not in not_known]
         if len(broken) > MOST_BROKEN * len(cells):
             raise RecordError(
                 f'column {name!r}: {cells[broken[0]]!r} in row {broken[0] + 1} is no {what}, as in '
