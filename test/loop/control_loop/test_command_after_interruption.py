@@ -1,5 +1,6 @@
 """Where the commands go on after an interruption: what is newer, a command or a report?"""
 
+import pytest
 
 from backlash_ros.core.loop.control_loop import ControlLoop, Driver
 from backlash_ros.core.loop.sample_counter import Output, SampleCounter
@@ -38,12 +39,9 @@ def first_command(heard_at: int, reported_at: int) -> float:
     return sent[-1]
 
 
-def test_a_command_that_was_heard_last_is_where_v_goes_on() -> None:
-    assert abs(first_command(heard_at=7, reported_at=7) - 4.0) <= MOVE
-
-
-def test_a_newer_report_says_what_the_driver_made_of_it() -> None:
-    assert abs(first_command(heard_at=5, reported_at=7) + 4.0) <= MOVE
+@pytest.mark.parametrize(('heard_at', 'v'), [(7, 4.0), (5, -4.0)])
+def test_v_goes_on_from_the_newest_of_a_command_and_a_report_at_7(heard_at, v):
+    assert abs(first_command(heard_at, reported_at=7) - v) <= MOVE
 
 
 def test_reports_are_heard_first_where_a_gap_makes_the_loop_begin_again() -> None:

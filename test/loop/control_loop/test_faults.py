@@ -158,3 +158,14 @@ def test_a_clock_that_is_set_is_an_interruption_or_taken_for_lost_outputs(
     world.run(100)
     statistics = world.loop.statistics
     assert (statistics.interruptions, statistics.lost) == (interruptions, lost)
+
+
+def test_a_take_up_rate_that_is_set_live_is_how_fast_v_crosses_the_gap() -> None:
+    world = SimulatedLoop()
+    world.learn()
+    world.controller.take_up(world.p.replaced({'inverse.take_up_rate': 50.0}))
+    begun = len(world.sent)
+    world.run(100)
+    moves = np.abs(np.diff(world.sent[begun:]))
+    # The gap is 6 wide and is crossed four times in these two periods, by half a unit in a sample.
+    assert 40 < np.isclose(moves, 0.5, atol=1e-9).sum() < 52

@@ -37,11 +37,13 @@ def one_processor(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_run_writes_its_results_and_prints_a_table(tmp_path, capsys):
-    assert main(['--duration', '0.5', '--out', str(tmp_path)]) == 0
+    assert main(['--duration', '0.5', '--out', str(tmp_path), '--set', 'frequency=300']) == 0
     files = {path.name for path in tmp_path.iterdir()}
     assert files >= {'report.html', 'samples.csv', 'summary.json', 'parameters.yaml'}
     assert json.loads((tmp_path / 'summary.json').read_text())['samples'] == 50
-    lines = capsys.readouterr().out.splitlines()
+    out, warned = capsys.readouterr()
+    lines = out.splitlines()
+    assert 'samples per period' in warned
     assert [line.split()[0] for line in lines[1:4]] == ['m', 'c_r', 'c_l']
     assert lines[-1] == f'report: {tmp_path / "report.html"}'
 
