@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Mapping
 from concurrent.futures import Future
 from itertools import cycle
+from math import isfinite, nan
 from typing import NamedTuple
 
 from rclpy.duration import Duration
@@ -171,7 +172,7 @@ class ControllerNode(ManagedNode):
             # that nobody was listened to is no silence of the driver.
             for loop in self.configured:
                 loop.renew(loop.estimate)
-                loop.heard.y_at = None
+                loop.heard.y_at = nan
         elif self.settings.lockstep:  # simulated time hurts nobody
             self._await_loop()
         else:
@@ -196,7 +197,7 @@ class ControllerNode(ManagedNode):
                 io.publisher.get_subscription_count() >= wanted
                 and self._steps.listeners >= wanted - 1
                 and (self.count_publishers(io.topics.reference) > 0 if lockstep
-                     else all(loop.heard.y_m_at is not None for loop in self.configured))
+                     else all(isfinite(loop.heard.y_m_at) for loop in self.configured))
             )
 
         self.call_when(

@@ -7,6 +7,7 @@ driver is silent, how a stall is caught up with.
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import nan
 
 from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.control.limits import Limits
@@ -53,7 +54,7 @@ class Controller:
             self._configure(None, self.loop.v if self.loop.knows_v else None)
         else:
             self.loop.renew(self.loop.estimate)
-            self.loop.heard.y_at = None
+            self.loop.heard.y_at = nan
         self.active = True
 
     def deactivate(self) -> None:

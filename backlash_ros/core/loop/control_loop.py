@@ -41,14 +41,14 @@ class Driver(NamedTuple):
 
 @dataclass
 class Newest:
-    """What has come last: y_m; when it and y came, on the steady clock [s], None before.
+    """What has come last: y_m; when it and y came, on the steady clock [s]; nan before.
 
     unanswered: outputs, as long as nobody knew v. before_reports: estimate at the first report.
     """
 
     y_m: float = nan
-    y_m_at: float | None = None
-    y_at: float | None = None
+    y_m_at: float = nan
+    y_at: float = nan
     unanswered: int = 0
     before_reports: Estimate | None = None
 
@@ -97,17 +97,13 @@ class ControlLoop:
     @property
     def counted(self) -> dict[str, int]:
         """All counts by name, also of what LoopFigures has besides."""
-        statistics = self.statistics
-        return {
-            **statistics.by_name(), 'wraps': statistics.wraps,
-            'dead_workers': self.executor.restarts,
-        }
+        wraps, dead = self.statistics.wraps, self.executor.restarts
+        return {**self.statistics.by_name(), 'wraps': wraps, 'dead_workers': dead}
 
     @property
     def unreferred_s(self) -> float:
-        """Since the newest reference [s], 0 before the first."""
-        at = self.heard.y_m_at
-        return 0.0 if at is None else self._driver.steady_s() - at
+        """Since the newest reference [s], nan before the first."""
+        return self._driver.steady_s() - self.heard.y_m_at
 
     @property
     def begins(self) -> bool:
@@ -165,13 +161,12 @@ class ControlLoop:
 
     def send(self, v: float) -> None:
         """Send a command and note when it left; nothing while another controller commands."""
-        if self.standing_down:
-            return
-        if v != self.v:  # it is none of the core
-            self.core.motion = Motion(v, v - self.v, v)
-        self.knows_v = True
-        self._send(v)
-        self.commands.publish(v, self._driver.now_ns())
+        if not self.standing_down:
+            if v != self.v:  # it is none of the core
+                self.core.motion = Motion(v, v - self.v, v)
+            self.knows_v = True
+            self._send(v)
+            self.commands.publish(v, self._driver.now_ns())
 
     def _is_usable(self, output: Output, arrival: Arrival, y_m: float) -> bool:
         """Count a message of y; returns whether there is a command to be made of it."""
@@ -280,9 +275,9 @@ class ControlLoop:
     @property
     def is_overdue(self) -> bool:
         """Whether the driver has been silent for too long, and that is new."""
-        at = self.heard.y_at
-        return at is not None and self.phase in (Phase.BEGINS, Phase.RUNS) \
-            and 0.0 < self._p.timeout.plant_output < self._driver.steady_s() - at
+        silent_s = self._driver.steady_s() - self.heard.y_at
+        return self.phase in (Phase.BEGINS, Phase.RUNS) \
+            and 0.0 < self._p.timeout.plant_output < silent_s
 
     def give_up(self) -> None:
         """The driver is silent: whenever it comes back, its state will be unknown."""
@@ -306,7 +301,7 @@ class ControlLoop:
     def resume(self) -> None:
         """Command again, from the newest v that was heard; the state of the plant is unknown."""
         self._happens(Event.RIVAL_GONE)
-        self.heard.y_at = None
+        self.heard.y_at = nan
         self._renew_core(self.estimate)
 
     def end(self, action: str) -> None:
@@ -355,8 +350,6 @@ class ControlLoop:
         if v != self.v:
             self.core.motion = at_rest(v)
         self.knows_v = True
-
-    # --- what can be asked of it -----------------------------------------------------------------
 
     def adapt(self, adapting: bool) -> None:
         """Learn, or hold the estimates."""

@@ -80,8 +80,7 @@ class LoopStatistics(Counts):
         self._y_before = y
         if not abs(y - self._y) <= self.still_band:
             self._y, self.still, self.still_v = y, 0, (v, v)
-        self.still += 1
-        self.still_v = _with(v, self.still_v)
+        self.still, self.still_v = self.still + 1, _with(v, self.still_v)
 
     def latencies_ms(self, *shares: float) -> list[float]:
         """Latencies that these shares of the latest commands stayed below; nan without any."""
