@@ -23,17 +23,10 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from queue import SimpleQueue
-from struct import Struct
 from threading import Event, Thread
 from typing import Any, BinaryIO
 
 from backlash_ros.core.jobs.executor import LOST, Channel, Executor, Failure, SampleBuffer, computed
-
-NICENESS = 5  # beyond that of the loop
-LENGTH = Struct('<Q')  # of an answer, in bytes, before it
-# Wait before a worker is replaced [s] that died without an answer, as the one before it did: the
-# first, and the longest, by doubling.
-FIRST_WAIT_S, LONGEST_WAIT_S = 0.1, 10.0
 
 
 @dataclass
@@ -146,9 +139,8 @@ class WorkerExecutor(Executor):
         if dead.sent > bool(dead.unwritten):
             failure = Failure(LOST, f'the worker (process {dead.process.pid}) died')
             self._submitted.popleft().result = failure
-        wait_s = 0.0
-        if self._deaths > 1:
-            wait_s = min(FIRST_WAIT_S * 2.0 ** min(self._deaths - 2, 10), LONGEST_WAIT_S)
+        # At once, but where it died without an answer as the one before it did: longer each time.
+        wait_s = min(0.1 * 2.0 ** min(self._deaths - 2, 7), 10.0) if self._deaths > 1 else 0.0
         self._starting = Thread(
             target=self._start_another, args=(dead.process, wait_s), daemon=True)
         self._starting.start()
@@ -159,7 +151,7 @@ class WorkerExecutor(Executor):
             try:
                 self._started.put(_start(self._preload))
             except OSError:  # no memory or no more processes
-                wait_s = LONGEST_WAIT_S
+                wait_s = 10.0
             else:
                 return
 
@@ -185,11 +177,11 @@ def _request(channel: Channel, still_open: list[int]) -> bytes:
 
 def _answers_in(received: bytearray) -> Iterator[Any]:
     """Take the complete answers out of what was received."""
-    while len(received) >= LENGTH.size:
-        end = LENGTH.size + LENGTH.unpack_from(received)[0]
+    while len(received) >= 8:  # bytes of the length
+        end = 8 + int.from_bytes(received[:8], 'little')
         if len(received) < end:
             return
-        body = bytes(received[LENGTH.size:end])
+        body = bytes(received[8:end])
         del received[:end]
         yield pickle.loads(body)
 
@@ -211,7 +203,7 @@ def _start(preload: tuple[str, ...]) -> subprocess.Popen[bytes]:
         os.set_blocking(pipe.fileno(), False)
     # From here, so that it holds for its imports as well; a loop in real time passes that on.
     os.sched_setscheduler(process.pid, os.SCHED_OTHER, os.sched_param(0))
-    niceness = os.getpriority(os.PRIO_PROCESS, 0) + NICENESS
+    niceness = os.getpriority(os.PRIO_PROCESS, 0) + 5
     os.setpriority(os.PRIO_PROCESS, process.pid, niceness)
     with suppress(OSError):  # a kernel that does not share the processors between sessions
         Path(f'/proc/{process.pid}/autogroup').write_text(str(niceness))
@@ -287,7 +279,7 @@ def _result_of(body: bytes, record: SampleBuffer) -> bytes:
 def _send(pipe: BinaryIO, content: Any) -> None:
     body = pickle.dumps(content, -1)
     try:
-        pipe.write(LENGTH.pack(len(body)) + body)
+        pipe.write(len(body).to_bytes(8, 'little') + body)
         pipe.flush()
     except BrokenPipeError:  # its parent is gone
         os._exit(0)
