@@ -11,7 +11,6 @@ from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 
 LARGEST_SIGNAL = 1e12  # no unit makes a measurement larger; squares of it still are numbers
-ROUNDING = 1e-14  # relative, of a v that has arrived at its target
 
 
 def plausible(value: float) -> bool:
@@ -110,7 +109,8 @@ class Limits:
         move = max(move, -self._most_towards(v - self.low))
         move = min(max(move, before.move - most), before.move + most)
         sent = v + move
-        if abs(sent - target) <= ROUNDING * (abs(v) + abs(target)):
+        # But for rounding v has arrived.
+        if abs(sent - target) <= 1e-14 * (abs(v) + abs(target)):
             sent = target
         return Motion(sent, move, target, asked)
 

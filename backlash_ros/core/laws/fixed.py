@@ -29,25 +29,24 @@ class FixedBacklash(Law):
     fully.
     """
 
+    adapting = False
+
     def __init__(
         self, initial: Estimate, model: StateModel, noise_std: float, doubt: float,
     ) -> None:
         self.estimate = replace(
             initial, std_m=0.0, std_c_r=0.0, std_c_l=0.0, status=Status.TRACKING
         )
-        self.adapting = False
         self._innovation = nan
         n = model.order
         # A gap of exactly 0 has c_l = c_r, which (2.1) does not know: then u = m (v - c).
         gapless = initial.c_r == initial.c_l
         self._backlash = None if gapless else Backlash(initial.m, initial.c_r, initial.c_l)
-        self._model, self._c = model, model.c
+        self._model = model
         self._transition = np.eye(n + 1)
         self._transition[:n, :n], self._transition[:n, n] = model.a, model.b
-        self._input = np.append(model.b, 0.0)
-        self._noise_var = max(noise_std, 1e-12) ** 2
         self._doubt = doubt
-        self._least_noise, self._noise = self._noise_var**0.5, NoiseLevel()
+        self._noise_std, self._noise = max(noise_std, 1e-12), NoiseLevel()
         self._x: Array = np.zeros(n + 1)
         self._p: Array = np.zeros((n + 1, n + 1))
         self._u = 0.0
@@ -61,6 +60,10 @@ class FixedBacklash(Law):
     def u_hat(self) -> float:
         """u of the given backlash plus the estimated disturbance."""
         return self._u + float(self._x[-1])
+
+    @property
+    def _noise_var(self) -> float:
+        return max(self._noise.std, self._noise_std) ** 2
 
     @property
     def innovation(self) -> float:
@@ -79,7 +82,7 @@ class FixedBacklash(Law):
 
     def predicted(self, u: float) -> float:
         """y(k+1) with this u from the backlash."""
-        return self._c * float(self._transition[0] @ self._x + self._input[0] * u)
+        return self._model.c * float(self._transition[0] @ self._x + self._model.b[0] * u)
 
     def update(self, y: float | None, interval: Interval) -> None:
         """Take in y(k), None if it was lost, and v of the interval before it."""
@@ -87,7 +90,8 @@ class FixedBacklash(Law):
         backlash = self._backlash
         before = self._u
         self._u = e.m * (interval.v - e.c_r) if backlash is None else backlash.step(interval.v)
-        x = self._transition @ self._x + self._input * self._u
+        x = self._transition @ self._x
+        x[:-1] += self._model.b * self._u
         p = self._transition @ self._p @ self._transition.T
         p[-1, -1] += (self._doubt * (self._u - before)) ** 2
         if y is None:
@@ -98,11 +102,11 @@ class FixedBacklash(Law):
                 x_scale = 1e3 * (abs(y) + self._noise_var**0.5)
                 p[:-1, :-1] += x_scale**2 * np.eye(len(x) - 1)
                 self._started = True
-            cross = self._c * p[:, 0]
-            variance = self._c * cross[0] + self._noise_var
-            self._innovation = y - self._c * float(x[0])
+            c = self._model.c
+            cross = c * p[:, 0]
+            variance = c * cross[0] + self._noise_var
+            self._innovation = y - c * float(x[0])
             self._noise.take(self._innovation)
-            self._noise_var = max(self._noise.std, self._least_noise) ** 2
             gain = cross / variance
             x = x + gain * self._innovation
             p -= np.outer(gain, cross)

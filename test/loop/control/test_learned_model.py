@@ -172,7 +172,7 @@ def redesigned(
 def test_feedback_softens_until_the_loop_is_as_safe_as_the_one_it_replaces() -> None:
     safe = redesigned(motor(), motor(0.5), WEIGHTS)
     assert safe is not None
-    assert safe.feedback.gain == pytest.approx(safe.gains.state)
+    assert safe.feedback.gain == pytest.approx(safe.plans[0].gains.state)
     # With an integral the loop around a motor half as fast would keep less than around either.
     weights = Weights(1e-2, 1e-3, 60)
     present = design(StateModel(motor()), weights)
@@ -184,7 +184,7 @@ def test_feedback_softens_until_the_loop_is_as_safe_as_the_one_it_replaces() -> 
     assert modulus_margin(softer.model, nominal.feedback) < had
     assert modulus_margin(softer.model, softer.feedback) >= had
     # The trajectory is not slower for it.
-    assert softer.gains.preview == pytest.approx(nominal.gains.preview)
+    assert softer.plans[0].gains.preview == pytest.approx(nominal.plans[0].gains.preview)
 
 
 def test_a_model_without_gains_is_refused() -> None:

@@ -126,6 +126,18 @@ def test_no_noise_of_y_hides_a_turn_beside_which_the_gap_is_small() -> None:
     assert trajectory.state.side is Region.RIGHT
 
 
+def test_noise_of_the_references_asks_for_a_trajectory_that_it_moves_less() -> None:
+    trajectory = IdealTrajectory(SLOW)
+    trajectory.begin(0.0)
+    for r in np.random.default_rng(1).standard_normal(60):
+        trajectory.take(r)
+        trajectory.prepare()
+    before = trajectory.references.noise_gains[-1]
+    assert not trajectory.soften(0.0), 'without a gap noise costs no crossing'
+    assert trajectory.soften(1.0)
+    assert trajectory.references.noise_gains[-1] < 0.5 * before
+
+
 def test_a_deviation_that_noise_explains_is_left_alone() -> None:
     feedback = StateFeedback(SLOW, 1.0, 1e-3)
     feedback.trust = Trust(held_for=TRUSTED_AFTER)

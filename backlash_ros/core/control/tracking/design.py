@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
+from math import hypot
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,16 +22,13 @@ Gain = list[float]
 # while v meets its limits or the estimate is new; that one while the backlash is unknown.
 SCHEDULE = (1.0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6)
 SOFTEST = 4
+# The same for the ideal trajectory: one that asks for less is moved less by noise of y_m.
+SOFTER = (1.0, 1e2, 1e4)
 # Times the input weight with which feedback around a better G is tried in turn, until its loop is
 # as safe as the one it replaces. The trajectory keeps the weight that was asked for.
 SAFER = (1.0, *np.geomspace(1.1, 100.0, 60).tolist())
-# Slope, in first guesses, that feedback has to bear to be used while the backlash is unknown.
-# Plants that bear less are led astray by any feedback that would help, and learn faster than they
-# go astray without.
-WRONG_SLOPE = 1.35
 HORIZON = 300  # samples within which a wrong u must matter, and u* answers to a reference
 LOOK_AHEAD = 20  # samples, at most, for which u* is known ahead
-SAFE_MARGIN = 0.5  # modulus margin that is safe in any case: no sensitivity above 2
 
 
 @dataclass(frozen=True)
@@ -46,48 +44,69 @@ class Weights:
 
 
 @dataclass(frozen=True)
+class Plan:
+    """One ideal trajectory.
+
+    states (L, n + 1), references (L, N + 1): u* of the next L samples, of [x*; q*] and the
+    references. noise_gains: see ReferenceWindow.
+    """
+
+    gains: PreviewGains
+    states: Array
+    references: Array
+    noise_gains: Array
+
+    def replayed(
+        self, model: StateModel, references: Array, history: int,
+    ) -> tuple[list[float], float]:
+        """x* and q* at the sample of the newest window, from rest at the oldest reference.
+
+        With z = [x*; q*] and u_p = -sum f_j r(k+j) it is z(k+1) = F z(k) + [B; 0] u_p + [0; 1] r.
+        history: for how many samples at most.
+        """
+        n, closed = model.order, _closed(model, self.gains)
+        inputs = np.zeros((n + 1, 2))
+        inputs[:n, 0], inputs[n, 1] = model.b, 1.0
+        by_preview = -np.convolve(references, self.gains.preview[::-1], 'valid')
+        steps = len(by_preview) - 1  # the newest one makes the next state
+        start = np.append(model.equilibrium * references[0], 0.0)
+        z = np.linalg.matrix_power(closed, steps) @ start
+        pairs = np.column_stack([by_preview[:steps], references[:steps]])[::-1]
+        responses = powers(closed, inputs, max(history, steps))
+        z = z + np.einsum('kij,kj->i', responses[:steps], pairs)
+        return z[:n].tolist(), float(z[n])
+
+
+@dataclass(frozen=True)
 class TrackingDesign:
     """Gains of one model of G.
 
-    gains: of the ideal trajectory. feedback: of the deviations from it. schedule: gains (n,), that
-    of full feedback first, each with less than the one before: see SCHEDULE; where v meets its
-    limits full feedback would cycle between them.
-    acquisition: gain (n,) while the backlash is unknown; None where no feedback is better.
-    gentle: gain (n,) that leads y back while the reference rests. push: |x| after HORIZON
-    samples of u = 1; push_ahead: |y| after LOOK_AHEAD. plan_states (L, n + 1), plan_references
-    (L, N + 1): u* of the next L samples of [x*; q*] and the references. noise_gains: see
-    ReferenceWindow.
+    plans: ideal trajectories, each with more weight of u than the one before, for references with
+    noise. feedback: of the deviations from them. schedule: gains (n,), that of full feedback first,
+    each with less than the one before: see SCHEDULE; where v meets its limits full feedback would
+    cycle between them. acquisition: gain (n,) while the backlash is unknown; None where no feedback
+    is better. gentle: gain (n,) that leads y back while the reference rests. push: |x| after
+    HORIZON samples of u = 1; push_ahead: |y| after LOOK_AHEAD.
     """
 
     model: StateModel
-    gains: PreviewGains
+    plans: tuple[Plan, ...]
     feedback: Feedback
     schedule: tuple[Gain, ...]
     acquisition: Gain | None
     gentle: Gain
     push: float
     push_ahead: float
-    plan_states: Array
-    plan_references: Array
-    noise_gains: Array
 
-    def replayed(self, references: Array, history: int) -> tuple[list[float], float]:
-        """x* and q* at the sample of the newest window, from rest at the oldest reference.
+    @cached_property
+    def schedule_rows(self) -> Array:
+        """The schedule as a matrix."""
+        return np.array(self.schedule)
 
-        With z = [x*; q*] and u_p = -sum f_j r(k+j) it is z(k+1) = F z(k) + [B; 0] u_p + [0; 1] r.
-        history: for how many samples at most.
-        """
-        n, closed = self.model.order, _closed(self.model, self.gains)
-        inputs = np.zeros((n + 1, 2))
-        inputs[:n, 0], inputs[n, 1] = self.model.b, 1.0
-        by_preview = -np.convolve(references, self.gains.preview[::-1], 'valid')
-        steps = len(by_preview) - 1  # the newest one makes the next state
-        start = np.append(self.model.equilibrium * references[0], 0.0)
-        z = np.linalg.matrix_power(closed, steps) @ start
-        pairs = np.column_stack([by_preview[:steps], references[:steps]])[::-1]
-        responses = powers(closed, inputs, max(history, steps))
-        z = z + np.einsum('kij,kj->i', responses[:steps], pairs)
-        return z[:n].tolist(), float(z[n])
+    @cached_property
+    def schedule_sizes(self) -> list[float]:
+        """|K| of each."""
+        return [hypot(*gain) for gain in self.schedule]
 
 
 def design(model: StateModel, weights: Weights, weight_factor: float = 1.0) -> TrackingDesign:
@@ -98,7 +117,9 @@ def design(model: StateModel, weights: Weights, weight_factor: float = 1.0) -> T
     # rad per sample, up to which y is corrected while the reference rests
     rest_bandwidth = 1.0 / 80.0
     rho = input_weight(model, weights)
-    gains = lq_gains(model, rho, weights.integral_weight, weights.preview)
+    plans = tuple(
+        _plan(model, lq_gains(model, more * rho, weights.integral_weight, weights.preview))
+        for more in SOFTER)
     feedback = feedback_around(model, weights, weight_factor)
     schedule = [feedback.gain.tolist(), *(
         lq_gains(model, max(more, weight_factor) * rho).state.tolist() for more in SCHEDULE[1:]
@@ -107,11 +128,10 @@ def design(model: StateModel, weights: Weights, weight_factor: float = 1.0) -> T
     gentle = lq_gains(model, power_gain(model.transfer_function, rest_bandwidth)).state
     ahead, later = (powers(model.a, model.b, k).sum(axis=0) for k in (LOOK_AHEAD, HORIZON))
     return TrackingDesign(
-        model, gains, feedback, tuple(schedule),
+        model, plans, feedback, tuple(schedule),
         schedule[SOFTEST] if _bears_wrong_slope(model, SCHEDULE[SOFTEST] * rho) else None,
         gentle.tolist(),
         float(np.linalg.norm(later)), model.c * abs(float(ahead[0])),
-        *_plan(model, gains), _noise_gains(model, gains),
     )
 
 
@@ -121,13 +141,13 @@ def better_design(
     """Return the design for a better model of G, None where it is no safe replacement.
 
     It replaces the present one where its loop around the better G keeps a modulus margin that is
-    usual (SAFE_MARGIN), or at least as large as that of the present loop around the G it was made
+    safe in any case, or at least as large as that of the present loop around the G it was made
     for or around the better one; the weight of its input is raised as far as this takes, and no
     further: what is weaker than it has to be is the measure for the next G, and so lost for good.
     A loop that is unstable around the better G is replaced by any stable one; an unstable one
     replaces none.
     """
-    needed = SAFE_MARGIN
+    needed = 0.5  # no sensitivity above 2
     try:
         for weight_factor in SAFER:
             reached = modulus_margin(model, feedback_around(model, weights, weight_factor))
@@ -173,7 +193,10 @@ def lq_gains(
 
 @lru_cache(maxsize=16)
 def _bears_wrong_slope(model: StateModel, input_weight: float) -> bool:
-    return tolerates(Feedback(model, lq_gains(model, input_weight).state), WRONG_SLOPE)
+    # Slope, in first guesses. Plants that bear less are led astray by any feedback that would help,
+    # and learn faster than they go astray without.
+    wrong_slope = 1.35
+    return tolerates(Feedback(model, lq_gains(model, input_weight).state), wrong_slope)
 
 
 def _closed(model: StateModel, gains: PreviewGains) -> Array:
@@ -186,7 +209,7 @@ def _closed(model: StateModel, gains: PreviewGains) -> Array:
     return closed
 
 
-def _plan(model: StateModel, gains: PreviewGains) -> tuple[Array, Array]:
+def _plan(model: StateModel, gains: PreviewGains) -> Plan:
     """u* of the next samples, of [x*; q*] and of the references, which stay at their last one."""
     n, last = model.order, len(gains.preview) - 1
     length = min(LOOK_AHEAD, last // 3) + 1
@@ -205,7 +228,9 @@ def _plan(model: StateModel, gains: PreviewGains) -> tuple[Array, Array]:
         by_reference[:n] -= np.outer(model.b, preview)
         by_reference[n, min(j, last)] += 1.0
         by_state = closed @ by_state
-    return states, references
+    # What is ahead rests on references that are not averaged yet as well.
+    tail = float(np.linalg.norm(references[:, 2 * last // 3:], axis=1).max())
+    return Plan(gains, states, references, np.maximum(_noise_gains(model, gains), tail))
 
 
 def _noise_gains(model: StateModel, gains: PreviewGains) -> Array:

@@ -25,9 +25,6 @@ Array = NDArray[np.float64]
 TRUSTED_AFTER = 40  # samples for which an estimate has to hold before it gets full feedback
 # An estimate this sharp, in relative deviations of slope and gap, counts so many times per sample.
 SHARP, SHARP_COUNTS = 0.01, 17
-# Feedback is as hard as leaves the standard deviation of what it makes of noise below this share of
-# the u that the gap takes.
-NOISE_SHARE = 0.1
 
 
 @dataclass
@@ -87,18 +84,15 @@ class StateFeedback:
         self.trust, self.state = Trust(), FeedbackState()
         self._shrinkage, self._noise_std = shrinkage, noise_std
         self._newest: Estimate | None = None
-        # The u that the gap takes, and that or the largest |u*| so far.
-        self._gap_u = self._scale = 0.0
+        self.gap_u = 0.0  # that the gap takes
         self.use(design)
 
     def use(self, design: TrackingDesign) -> None:
         """Use these gains."""
         self._design = design
         self._x_cov: Array | None = None
-        # Of every gain: as a matrix, its size, and the deviation of K x_hat.
-        self._gains = np.array(design.schedule)
-        self._sizes = [hypot(*gain) for gain in design.schedule]
-        self._u_std, self._quiet = [0.0] * len(self._sizes), 0
+        # Deviations of K x_hat for every gain, and the one in use.
+        self._u_std, self._quiet = [0.0] * len(design.schedule), 0
         self.x_std = self._ignored = 0.0  # deviation of x_hat, |x_hat - x*| that is left alone
 
     def go_on_from(self, other: StateFeedback, state_known: bool) -> None:
@@ -107,7 +101,7 @@ class StateFeedback:
         state_known: whether it does not.
         """
         self.trust, self.state = replace(other.trust), replace(other.state)
-        self._gap_u = other._gap_u
+        self.gap_u = other.gap_u
         self.prepare(other._x_cov, self._noise_std)
         if not state_known:
             self.trust = Trust(sharp_counts=1)
@@ -136,8 +130,7 @@ class StateFeedback:
         first: of this loop; an estimate was known before then.
         """
         trust, gap = self.trust, estimate.c_r - estimate.c_l
-        self.state.asked, self._gap_u = max(self.state.asked, abs(ideal)), estimate.m * gap
-        self._scale = max(self.state.asked, self._gap_u)
+        self.state.asked, self.gap_u = max(self.state.asked, abs(ideal)), estimate.m * gap
         if not (trust.known and estimate.learned):
             # Without deviations nobody knows how far it may be relied on.
             trust.held_for = trust.in_use_for = 0
@@ -155,14 +148,15 @@ class StateFeedback:
     def prepare(self, x_cov: Array | None, noise_std: float) -> None:
         """Take in the covariance of x_hat, None where it is unknown, and the noise of y."""
         if x_cov is not self._x_cov:
-            self._x_cov = x_cov
+            self._x_cov, gains = x_cov, self._design.schedule_rows
             if x_cov is not None:
-                variances = ((self._gains @ x_cov) * self._gains).sum(axis=1)
+                variances = ((gains @ x_cov) * gains).sum(axis=1)
                 self._u_std = np.sqrt(np.maximum(variances, 0.0)).tolist()
                 self.x_std = sqrt(max(float(x_cov.trace()), 0.0))
         # By as much v may rest off: one rule for motion and rest.
         self._ignored = ARRIVED * max(CLOSE * noise_std, UNCERTAIN * self.x_std)
-        last, most = len(self._sizes) - 1, NOISE_SHARE * self._gap_u or inf
+        # As hard as leaves what feedback makes of noise below a tenth of the u that the gap takes.
+        last, most = len(self._u_std) - 1, 0.1 * self.gap_u or inf
         self._quiet = next((i for i in range(last) if self._noise_of(i) <= most), last)
 
     def deviation(self, x_hat: Sequence[float] | Array, x: Sequence[float]) -> list[float]:
@@ -207,13 +201,18 @@ class StateFeedback:
             self.state.integral += difference
 
     @property
+    def _scale(self) -> float:
+        """The u that the gap takes, or the largest |u*| so far."""
+        return max(self.state.asked, self.gap_u)
+
+    @property
     def noise(self) -> float:
         """Standard deviation of what feedback makes of noise."""
         return self._noise_of(self._quiet)
 
     def _noise_of(self, level: int) -> float:
         """By the covariance of x_hat, and at least for errors of y of half its noise."""
-        return max(self._u_std[level], 0.5 * self._noise_std * self._sizes[level])
+        return max(self._u_std[level], 0.5 * self._noise_std * self._design.schedule_sizes[level])
 
     @property
     def most(self) -> float:
@@ -226,7 +225,8 @@ class StateFeedback:
         if not self.trust.begun:
             return self.state.width * self._scale
         # |K|: what full feedback makes of an error of y.
-        return LARGEST_FEEDBACK * max(self._scale, TOLERANCE * self._noise_std * self._sizes[0])
+        by_noise = TOLERANCE * self._noise_std * self._design.schedule_sizes[0]
+        return LARGEST_FEEDBACK * max(self._scale, by_noise)
 
     @property
     def reach(self) -> float:

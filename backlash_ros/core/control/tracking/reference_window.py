@@ -12,10 +12,6 @@ from backlash_ros.core.plant.noise_level import NoiseLevel
 
 Array = NDArray[np.float64]
 
-# Mean square of what is left of the references beside a parabola, in those of the noise, up to
-# which they are taken for one, and from which on they are not: at a step, or a sharp turn.
-PARABOLA, NO_PARABOLA = 1.8, 3.0
-
 
 class Parabolas(NamedTuple):
     """What parabolas take from 2 H + 1 references, for several widths w <= H to either side.
@@ -75,15 +71,19 @@ class ReferenceWindow:
     """
 
     def __init__(self, preview: int, history: int, noise_gains: Array) -> None:
-        self.history, self.noise_gains = history, noise_gains
+        self.noise_gains = noise_gains
         self._preview, self._kept = preview, history + preview + 1
-        self._parabolas = parabolas(preview)
         # As they came, as they are used, and what u* makes of noise of 1 in them. Written from the
         # left to the right; when they are full their end moves to the front.
         self._rows: Array = np.zeros((3, 2 * self._kept))
         self._start = self._end = 0
         self._noise = NoiseLevel()
         self.u_noise_std = self.noise_spread = self.low = self.high = 0.0
+
+    @property
+    def noise_std(self) -> float:
+        """Of the references as they came."""
+        return self._noise.std
 
     @property
     def empty(self) -> bool:
@@ -122,7 +122,7 @@ class ReferenceWindow:
 
     def settle(self) -> None:
         """Make of the newest reference what only the next sample needs."""
-        newest, half = self._end - 1, self._parabolas.half
+        newest, half = self._end - 1, parabolas(self._preview).half
         self._rows[0, newest] = self._rows[1, newest]
         self._rows[2, newest] = self.noise_gains[0]
         self._noise.take(self._rows.item(0, newest))
@@ -142,15 +142,18 @@ class ReferenceWindow:
 
     def _average(self, at: int) -> None:
         """Average one reference, now that as many after it are known."""
-        fits, first, degrees, middle = self._parabolas
-        half, came, noise = self._parabolas.half, self._rows[0], self._noise.std
+        # Mean square of what is left beside a parabola, in those of the noise, up to which the
+        # references are taken for one, and from which on not: at a step, or a sharp turn.
+        one, none = 1.8, 3.0
+        fits, first, degrees, middle = parabolas(self._preview)
+        half, came, noise = fits.shape[1] // 2, self._rows[0], self._noise.std
         rest = fits @ came[at - half:at + half + 1]
         of_noise = rest / noise  # its square may be too small for a number
         squares = np.add.reduceat(of_noise * of_noise, first).tolist()
         reference = value = came.item(at)
         gain = float(self.noise_gains[0])
         for i, square in enumerate(squares):
-            share = min((NO_PARABOLA - square / degrees[i]) / (NO_PARABOLA - PARABOLA), 1.0)
+            share = min((none - square / degrees[i]) / (none - one), 1.0)
             if share > 0.0:
                 value += share * (reference - rest.item(middle[i]) - value)
                 gain += share * (self.noise_gains.item(i + 1) - gain)

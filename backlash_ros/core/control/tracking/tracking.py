@@ -23,8 +23,6 @@ from backlash_ros.core.plant.backlash import Region
 from backlash_ros.core.plant.noise_level import NoiseLevel
 from backlash_ros.core.plant.transfer_function import StateModel
 
-IN_FEEDBACK = 4.0  # times the noise of u* that feedback makes of the same noise
-NOISE_BAND = 4.0  # deviations of the noise in feedback that are worth a crossing of the gap
 FADING = 0.8  # per sample, of what is handed over
 
 
@@ -71,11 +69,17 @@ class Tracking(ControlStructure):
         self.feedback = StateFeedback(beginning, shrinkage, noise_std)
         self.rest = Rest(beginning)
         self.hand_over = HandOver()
-        self._y_noise, self._noise_std = NoiseLevel(), noise_std  # as measured, where that is more
+        self._y_noise = NoiseLevel()
         self._moves = deque([0.0], maxlen=100)  # by which v moved of late, as sizes
         self._engaged_for = 0  # samples since v has crossed the gap
-        # y, and the covariance of x_hat, of a command that the next one was not prepared after.
-        self._newest: tuple[float, NDArray[np.float64] | None] | None = None
+        # y, the covariance of x_hat and who knows both, of a command that the next one was not
+        # prepared after.
+        self._newest: tuple[float, NDArray[np.float64] | None, StateSource] | None = None
+
+    @property
+    def _noise_std(self) -> float:
+        """Of y as it was configured, or as measured, where that is more."""
+        return max(self._told_noise, self._y_noise.std)
 
     @property
     def may_change(self) -> bool:
@@ -121,6 +125,10 @@ class Tracking(ControlStructure):
         self.prepare()
         self._use(gains)
         self.feedback.prepare(source.x_cov, self._noise_std)
+        self._change_trajectory(source)
+
+    def _change_trajectory(self, source: StateSource) -> None:
+        """Be where the trajectory in use would be, and let v go on from where it is."""
         trajectory, feedback = self.trajectory, self.feedback
         trajectory.replay()
         if not trajectory.references.empty:
@@ -133,7 +141,7 @@ class Tracking(ControlStructure):
 
     def _use(self, chosen: TrackingDesign) -> None:
         self._design = chosen
-        self.trajectory.use(chosen)
+        self.trajectory.use(chosen, self.trajectory.softness)
         self.feedback.use(chosen)
         self.rest.use(chosen)
 
@@ -157,7 +165,7 @@ class Tracking(ControlStructure):
             deviation, inverse.limited or inverse.taking_up, rest.state.largest)
         u_d = plan.u - correction
         # What the noise of the references makes of u* and is not followed shows as a deviation.
-        noise = NOISE_BAND * feedback.noise + IN_FEEDBACK * plan.noise_band
+        noise = 4.0 * (feedback.noise + plan.noise_band)
         added = self.hand_over.fade()
         u_d += added
         pull, before = rest.pull_back(deviation, feedback.most), rest.state.mode
@@ -179,18 +187,19 @@ class Tracking(ControlStructure):
         u_d = min(max(u_d, plan.u - reach), plan.u + reach)
         v = self._invert(u_d, side, crossings, inverse)
         feedback.integrate(self._design.model.c * plan.x[0] - y, inverse.limited)
-        self._newest = y, x_cov
+        self._newest = y, x_cov, source
         return Command(u_d, v, 0.0)
 
     def prepare(self) -> None:
         """Go on to the next sample, if that is still to be done."""
         if self._newest is not None:
-            y, x_cov = self._newest
+            y, x_cov, source = self._newest
             self._newest = None
             self._y_noise.take(y)
-            self._noise_std = max(self._told_noise, self._y_noise.std)
             self.feedback.prepare(x_cov, self._noise_std)
             self.trajectory.prepare()
+            if self.feedback.trust.full and self.trajectory.soften(self.feedback.gap_u):
+                self._change_trajectory(source)
 
     def _go_on(self, estimate: Estimate, inverse: BacklashInverse) -> None:
         """Take in the estimate, and v from whoever has made it until now."""

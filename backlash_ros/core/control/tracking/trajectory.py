@@ -21,12 +21,8 @@ from backlash_ros.core.plant.backlash import Region
 
 Array = NDArray[np.float64]
 
-# u* has turned where it comes back by more than what the noise of the references does to it, in
-# standard deviations: the highest of many samples before a turn is some three above.
-TURN_BAND = 6.0
-# Nor is it a turn that would move y by less than its noise, unless it is this share of the u that
-# the gap takes.
-SMALLEST_TURN = 0.01
+# Share of the u that the gap takes, by which noise of the references may move u*.
+QUIET = 0.02
 
 
 @dataclass
@@ -66,15 +62,16 @@ class IdealTrajectory:
     def __init__(self, design: TrackingDesign) -> None:
         self.state = TrajectoryState([0.0] * design.model.order)
         self.references = ReferenceWindow(
-            len(design.gains.preview) - 1, design.model.memory, design.noise_gains
+            len(design.plans[0].references[0]) - 1, design.model.memory,
+            design.plans[0].noise_gains,
         )
         self.use(design)
 
-    def use(self, design: TrackingDesign) -> None:
-        """Be a trajectory of this design from the next sample on."""
-        self._design = design
-        self.references.noise_gains = design.noise_gains
-        self._newest_gains: list[float] = design.plan_references[:, -1].tolist()
+    def use(self, design: TrackingDesign, softness: int = 0) -> None:
+        """Be this one of the trajectories of a design from the next sample on."""
+        self._design, self.softness, self._plan = design, softness, design.plans[softness]
+        self.references.noise_gains = self._plan.noise_gains
+        self._newest_gains: list[float] = self._plan.references[:, -1].tolist()
         self._due: list[float] | None = None  # u* ahead at the next sample, but for its reference
         self._transition: list[tuple[list[float], float]] = list(
             zip(design.model.a.tolist(), design.model.b.tolist(), strict=True)
@@ -82,7 +79,24 @@ class IdealTrajectory:
 
     def go_on_from(self, other: IdealTrajectory) -> None:
         """Be where another trajectory of the same model is."""
-        self.references, self.state, self._due = other.references, replace(other.state), None
+        self.references, self.state = other.references, replace(other.state)
+        self.use(self._design, other.softness)
+
+    def soften(self, gap_u: float) -> bool:
+        """Ask for less where noise of the references makes u* cross a gap that takes this u.
+
+        Returns whether it does.
+        """
+        of_noise = [plan.noise_gains.item(-1) for plan in self._design.plans]
+        noise_std, now = self.references.noise_std, of_noise[self.softness]
+        if gap_u == 0.0 or noise_std * now <= QUIET * gap_u:
+            return False
+        softer = next((i for i, gain in enumerate(of_noise) if noise_std * gain <= QUIET * gap_u),
+                      of_noise.index(min(of_noise)))
+        if of_noise[softer] > 0.5 * now:
+            return False  # nothing is won: what moves u* is the reference itself
+        self.use(self._design, softer)
+        return True
 
     def replay(self) -> None:
         """Be where this design would be, had it been in use as long as references are kept."""
@@ -90,8 +104,9 @@ class IdealTrajectory:
         if references.empty:
             state.x = [0.0] * self._design.model.order
             return
-        state.x, state.q = self._design.replayed(references.all(), references.history)
-        state.ahead = self._ahead(references.window, self._design.plan_references)
+        model = self._design.model
+        state.x, state.q = self._plan.replayed(model, references.all(), model.memory)
+        state.ahead = self._ahead(references.window, self._plan.references)
 
     def begin(self, r: float) -> None:
         """Rest at y = r."""
@@ -123,7 +138,8 @@ class IdealTrajectory:
             state.extreme = ahead[0]
         before, taken = state.side, ceil(crossing)
         arrival = max(taken - 1, 0)
-        least = min(noise_std / self._design.push_ahead, SMALLEST_TURN * gap_u)
+        # What moves y by less than its noise is no turn, unless it is a hundredth of the gap.
+        least = min(noise_std / self._design.push_ahead, 0.01 * gap_u)
         state.noise = max(least, state.noise_band)
         if state.decided > 0:
             state.decided -= 1
@@ -153,17 +169,18 @@ class IdealTrajectory:
         """Do what the next sample needs, and its reference does not change."""
         self.advance()
         self.references.settle()
-        self.state.noise_band = TURN_BAND * self.references.u_noise_std
+        # The highest of many samples before a turn is some three deviations above.
+        self.state.noise_band = 6.0 * self.references.u_noise_std
         self._look_ahead()
 
     def _look_ahead(self) -> list[float]:
-        self._due = self._ahead(self.references.window[1:], self._design.plan_references[:, :-1])
+        self._due = self._ahead(self.references.window[1:], self._plan.references[:, :-1])
         return self._due
 
     def _ahead(self, references: Array, gains: Array) -> list[float]:
         """u* from [x*; q*] and these references on."""
         plan: list[float] = (
-            self._design.plan_states @ [*self.state.x, self.state.q] + gains @ references).tolist()
+            self._plan.states @ [*self.state.x, self.state.q] + gains @ references).tolist()
         return plan
 
 
