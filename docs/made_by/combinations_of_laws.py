@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from math import inf
 from typing import NamedTuple
 
@@ -32,8 +32,7 @@ TRUTH = (1.3, 3.0, -3.0)
 RIGHT, DEVIATIONS = 0.2, 5.0
 
 
-@dataclass(frozen=True)
-class Condition:
+class Condition(NamedTuple):
     """What is not as it should be.
 
     changes: of parameters. compensates: whether the gap is cancelled. rests: whether y_m stops
@@ -41,7 +40,7 @@ class Condition:
     which the driver limits v by itself; reports: whether it says so on applied_control.
     """
 
-    changes: dict[str, object] = field(default_factory=dict)
+    changes: Mapping[str, object] = {}
     compensates: bool = True
     rests: bool = False
     lost: float = 0.0
@@ -79,27 +78,18 @@ class Sample(NamedTuple):
     def is_right(self) -> bool:
         """Whether the estimates are what they are said to be."""
         e, gap = self.estimate, TRUTH[1] - TRUTH[2]
+        allowed = RIGHT * np.array([TRUTH[0], gap, gap])
         if e.learned:
-            allowed = [DEVIATIONS * std for std in (e.std_m, e.std_c_r, e.std_c_l)]
-        else:
-            allowed = [RIGHT * TRUTH[0], RIGHT * gap, RIGHT * gap]
-        return all(
-            abs(value - true) <= tolerance
-            for value, true, tolerance in zip((e.m, e.c_r, e.c_l), TRUTH, allowed, strict=True)
-        )
-
-
-def parameters_of(law: str, structure: str, condition: Condition) -> Parameters:
-    """The paper's plant with this law and structure."""
-    return Parameters({
-        'estimator.law': law, 'structure': structure, 'output_noise_std': NOISE,
-        'amplitude': AMPLITUDES[structure], **condition.changes,
-    })
+            allowed = DEVIATIONS * np.array([e.std_m, e.std_c_r, e.std_c_l])
+        return bool((np.abs(np.array([e.m, e.c_r, e.c_l]) - TRUTH) <= allowed).all())
 
 
 def run(law: str, structure: str, condition: Condition) -> list[Sample]:
-    """Run a loop; raises ParameterError for a combination that cannot work."""
-    p = parameters_of(law, structure, condition)
+    """The paper's plant in a loop; raises ParameterError for a combination that cannot work."""
+    p = Parameters({
+        'estimator.law': law, 'structure': structure, 'output_noise_std': NOISE,
+        'amplitude': AMPLITUDES[structure], **condition.changes,
+    })
     controller, plant, reference = build_controller(p), build_plant(p), build_reference(p)
     controller.compensating = condition.compensates
     rng = np.random.default_rng(SEED)
@@ -130,10 +120,8 @@ def outcome(samples: list[Sample]) -> str:
 
 def rows() -> tuple[list[str], list[list[str]]]:
     """Header, and a line for each law in each structure that it fits, a column per condition."""
-    header = ['law, structure', *CONDITIONS]
-    pairs = [(law, s) for s in STRUCTURES for law in LAWS if law_fits(law, s)]
-    return header, [
+    return ['law, structure', *CONDITIONS], [
         [f'`{law}`, `{structure}`',
          *(outcome(run(law, structure, condition)) for condition in CONDITIONS.values())]
-        for law, structure in pairs
+        for structure in STRUCTURES for law in LAWS if law_fits(law, structure)
     ]

@@ -1,7 +1,6 @@
 """Every law in every structure, whatever is not as it should be: bounded, and no false claim."""
 
 import re
-from dataclasses import replace
 from functools import cache
 from math import inf, isfinite
 
@@ -41,7 +40,7 @@ def asked_by_the_reference(structure: str, condition: str) -> float:
         'estimator.initial.m': 1.3, 'estimator.initial.c_r': 0.0, 'estimator.initial.c_l': 0.0,
         'control.min': -inf, 'control.max': inf, 'control.rate_max': inf, 'output_noise_std': 0.0,
     }
-    without = replace(CONDITIONS[condition], changes=changes, driver_limit=inf)
+    without = CONDITIONS[condition]._replace(changes=changes, driver_limit=inf)
     return max(abs(sample.u_d) for sample in run('fixed', structure, without))
 
 
