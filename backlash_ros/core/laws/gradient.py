@@ -37,6 +37,21 @@ from backlash_ros.core.plant.four_blocks import FourBlocks
 Array = NDArray[np.float64]
 
 
+class _Filters:
+    """W of phi and of u_d, and what returns of y, side by side in observer form."""
+
+    def __init__(self, blocks: FourBlocks) -> None:
+        models = [*[blocks.disturbance] * 4, blocks.returned]
+        self._a = models[0].state_space()[0]
+        self._b: Array = np.column_stack([model.state_space()[1] for model in models])
+        self._x: Array = np.zeros(self._b.shape)
+
+    def step(self, inputs: Array) -> Array:
+        """Their outputs after one more sample."""
+        self._x = self._a @ self._x + self._b * inputs
+        return np.asarray(self._x[0])
+
+
 class GradientEstimator(Law):
     """Learns (m, m c_r, m c_l) from y behind the filters of the four-block loop.
 
@@ -52,13 +67,9 @@ class GradientEstimator(Law):
         self._bounds, self._noise_square = bounds, (10.0 * noise_std) ** 2
         self._y = 0.0  # the newest one, or what was expected of it
         self._agreement = Agreement()
-        # W of phi and of u_d, and what returns of y, side by side in observer form.
-        models = [*[blocks.disturbance] * 4, blocks.returned]
-        self._a = models[0].state_space()[0]
-        self._b: Array = np.column_stack([model.state_space()[1] for model in models])
-        self._x: Array = np.zeros(self._b.shape)
+        self._filters = _Filters(blocks)
         self._phi: Array = np.zeros(3)
-        self._v_square = self._u_square = self._size = 0.0  # running means
+        self._means = [0.0, 0.0, 0.0]  # of v^2, u_d^2 and zeta' P zeta
         self._samples = 0
 
     @property
@@ -77,13 +88,13 @@ class GradientEstimator(Law):
         self._engage(interval, old)
         theta = np.array([old.m, old.m * old.c_r, old.m * old.c_l])
         self._u_hat = float(theta @ self._phi)
-        inputs = np.concatenate((self._phi, (interval.u_d, self._y)))
-        self._x = self._a @ self._x + self._b * inputs
-        filtered = self._x[0]
+        filtered = self._filters.step(np.concatenate((self._phi, (interval.u_d, self._y))))
         self._samples += 1
         share = 1.0 / min(self._samples, MEMORY)
-        self._v_square += share * (interval.v**2 - self._v_square)
-        self._u_square += share * (interval.u_d**2 - self._u_square)
+        v_square, u_square, mean_size = self._means
+        v_square += share * (interval.v**2 - v_square)
+        u_square += share * (interval.u_d**2 - u_square)
+        self._means = [v_square, u_square, mean_size]
         zeta = filtered[:3]
         returned = float(filtered[4])
         expected = float(theta @ zeta) - returned
@@ -93,13 +104,13 @@ class GradientEstimator(Law):
         self._y = y
         xi = float(theta @ zeta - filtered[3])
         eps = self._innovation = y - expected
-        if min(self._v_square, self._u_square) < LEAST_SQUARE:
+        if min(v_square, u_square) < LEAST_SQUARE:
             return
-        scaled = zeta * np.array([1.0 / self._v_square, 1.0, 1.0])
+        scaled = zeta * np.array([1.0 / v_square, 1.0, 1.0])
         size = float(zeta @ scaled)
-        self._size += share * (size - self._size)
-        norm = size + max(0.1 * self._size, self._noise_square / self._u_square)
-        norm += xi**2 / self._u_square
+        mean_size += share * (size - mean_size)
+        self._means[2] = mean_size
+        norm = size + max(0.1 * mean_size, self._noise_square / u_square) + xi**2 / u_square
         if norm == 0.0 or not self.adapting:
             return
         row = (*zeta.tolist(), y + returned)

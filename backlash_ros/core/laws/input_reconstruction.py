@@ -43,7 +43,7 @@ class InputReconstruction:
         self.innovation = nan
         self.samples = 0
         state = StateModel(model)
-        n = self._n = state.order
+        n = state.order
         # y is scaled so that a typical step of u, of size 1, shows in it with size 1: the median of
         # |G W| on the unit circle, W = 1/(z - 1). The least noise that is assumed is a share of the
         # weakest response, which counts as no weaker than 1e-4 of the typical one.
@@ -64,27 +64,25 @@ class InputReconstruction:
         except (np.linalg.LinAlgError, ValueError):
             variance = nan
         else:
-            self._gain = self._gain_of(steady)
-            self._after_steady = self._covariance = self._measured(steady)
-            variance = float(self._after_steady[-1, -1])
+            gain, self._covariance = self._gain_of(steady), self._measured(steady)
+            variance = float(self._covariance[-1, -1])
         if not 0.0 < variance < inf:  # rounding has taken over
             raise ParameterError(
                 'estimator.output_noise_std', noise_std, 'is so large that y says nothing of u',
                 'give the standard deviation of the noise on y, in the unit of y',
             )
         # While no sample is lost, prediction and correction are one map.
-        self._seen = self._c * self._step[0]
-        self._closed = self._step - np.outer(self._gain, self._seen)
+        closed = self._step - np.outer(gain, self._c * self._step[0])
+        self._steady = closed, gain, self._covariance
         self.std = sqrt(variance)
         self._z: Array = np.zeros(n + 1 + lag)  # given y(..k)
-        # Samples after a lost one until the covariance is stationary again.
-        self._steady_after = self._since_loss = 4 * lag
+        self._since_loss = 4 * lag
 
     def _stationary(self) -> Array:
         """Covariance of z before a measurement when no sample was ever lost."""
         from scipy import linalg  # where it is needed: 31 MB
 
-        size = self._n + 1
+        size = self._order + 1
         output, process = np.zeros((size, 1)), np.zeros((size, size))
         output[0, 0], process[-1, -1] = self._c, 1.0
         p = linalg.solve_discrete_are(
@@ -96,6 +94,10 @@ class InputReconstruction:
             covariance = self._propagated(self._measured(covariance))
             covariance[:size, :size] = p
         return covariance
+
+    @property
+    def _order(self) -> int:
+        return len(self._step) - 1 - self.lag
 
     @property
     def u_hat(self) -> float:
@@ -111,23 +113,23 @@ class InputReconstruction:
         """Whether the start is forgotten and u_hat about as good as without lost samples."""
         if self.samples <= 2 * self.lag:
             return False
-        steady = self._covariance is self._after_steady
+        steady = self._covariance is self._steady[2]
         return steady or bool(self._covariance[-1, -1] <= 4.0 * self.std**2)
 
     @property
     def x_hat(self) -> Array:
         """State of G given y(..k) in the coordinates of StateModel, shape (n,)."""
-        return np.asarray(self._z[:self._n] * self._scale)
+        return np.asarray(self._z[:self._order] * self._scale)
 
     def update(self, y: float | None) -> float:
         """Take in y(k), None if it was lost, and return u_hat(k - lag)."""
         self.samples += 1
         self._since_loss = 0 if y is None else self._since_loss + 1
-        if y is not None and self._since_loss > self._steady_after:
-            scaled = y / self._scale
-            self.innovation = (scaled - float(self._seen @ self._z)) * self._scale
-            self._z = self._closed @ self._z + self._gain * scaled
-            self._covariance = self._after_steady
+        # Samples after a lost one until the covariance is stationary again.
+        if y is not None and self._since_loss > 4 * self.lag:
+            scaled, (closed, gain, self._covariance) = y / self._scale, self._steady
+            self.innovation = (scaled - float((self._c * self._step[0]) @ self._z)) * self._scale
+            self._z = closed @ self._z + gain * scaled
             return float(self._z[-1])
         covariance, self._z = self._propagated(self._covariance), self._step @ self._z
         if y is None:
@@ -148,5 +150,5 @@ class InputReconstruction:
 
     def _propagated(self, p: Array) -> Array:
         p = self._step @ p @ self._step.T
-        p[self._n, self._n] += 1.0
+        p[self._order, self._order] += 1.0
         return np.asarray(0.5 * (p + p.T))
