@@ -123,12 +123,15 @@ def reports_with_holes() -> Heard:
 
 
 NUMERATOR, DENOMINATOR = model(0.004)
+NEAR = model(1.4 * PERIOD_S)  # another natural frequency
 
 
 @pytest.mark.parametrize(('heard', 'changes', 'subject', 'told'), [
     (heard_from_driver, {'sample_period': 0.05}, 'rate', ['25 Hz', 'set sample_period']),
     (heard_from_driver, {'plant__numerator': NUMERATOR, 'plant__denominator': DENOMINATOR},
      'G(z)', ['discretised']),
+    (heard_from_driver, {'plant__numerator': NEAR[0], 'plant__denominator': NEAR[1],
+                         'plant__uncertainty': 0.05}, 'G(z)', ['raise plant.uncertainty']),
     (lambda: with_outputs(some_lost), {}, 'lost samples', ['20 of 200 samples']),
     (lambda: with_outputs(
         lambda sent: [m._replace(number=k + 1) for k, m in enumerate(some_lost(sent))]
