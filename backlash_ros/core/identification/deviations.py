@@ -6,20 +6,33 @@ with normalised rows J and the Toeplitz matrix R of the residual's autocovarianc
 beyond those lags over which it lasts. Of white residuals that is H^-1; the error of a quantised y
 is not white. No variance is less than that of white noise. Other than the inflation of a WindowFit
 it believes that what is left over is noise, and averages out in the end.
+
+High frequencies that v hardly had leave zeros and delay of G open. Whatever noise puts there, a
+fast controller would act on it. Among the delays that fit alike, and within two standard deviations
+of each fit, the model is taken whose |G|^2, summed over the frequencies at which G is not known, is
+least: sampled plants that are driven through a hold have little gain there. Where the deviations of
+the fit leave no such frequency, it is those at which the delays that fit alike contradict it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from math import sqrt
+from typing import NamedTuple
 
 import numpy as np
+from numpy.polynomial.polynomial import polyval
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.fit import Problem
 from backlash_ros.core.estimation.posterior import WindowFit
+from backlash_ros.core.identification.structure import VAGUE, Model
 
 Array = NDArray[np.float64]
+
+GRID: Array = np.pi * (np.arange(40) + 0.5) / 40  # frequencies [rad/sample]
+SILENT = 0.1  # relative deviation, or difference, of G beyond which the record is silent
 
 
 def autocorrelation(residual: Array, lags: int) -> Array:
@@ -93,3 +106,91 @@ def lag_one(residual: Array, certain: bool = False) -> float:
         return 0.0
     chance = 3.0 / sqrt(len(residual)) if certain else 0.0
     return min(max(float(residual[1:] @ residual[:-1]) / energy - chance, 0.0), 0.99)
+
+
+class Response(NamedTuple):
+    """m G without its delay. covariance: of B and of A's coefficients that were fitted, a.
+
+    denominator: 1, a; integrator: whether 1 - 1/z multiplies it.
+    """
+
+    numerator: Array
+    denominator: Array
+    integrator: bool
+    covariance: Array
+
+    def at(self, frequencies: Array) -> NDArray[np.complex128]:
+        """At frequencies [rad/sample]."""
+        back = np.exp(-1j * np.asarray(frequencies))
+        value = back * polyval(back, self.numerator) / polyval(back, self.denominator)
+        return np.asarray(value / (1.0 - back) if self.integrator else value)
+
+    def std(self, frequencies: Array) -> Array:
+        """Relative deviation at frequencies [rad/sample], shape (N,)."""
+        back = np.exp(-1j * np.asarray(frequencies, dtype=float))
+        free, top = polyval(back, self.denominator), polyval(back, self.numerator)
+        # d log(mG): z^-i / B for b_i, -z^-j / A for a_j.
+        jacobian = np.array([
+            *(back**i / top for i in range(len(self.numerator))),
+            *(-back**j / free for j in range(1, len(self.denominator))),
+        ]).T
+        variance = np.einsum('ni,ij,nj->n', jacobian, self.covariance, jacobian.conj()).real
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+    @property
+    def known_up_to(self) -> float:
+        """Frequency [rad/sample] from which on G is not known; pi where it is throughout."""
+        known = np.flatnonzero(self.std(GRID) <= SILENT)
+        return float(GRID[known[-1]]) if len(known) else float(GRID[0])
+
+
+def response_of(found: Model, covariance: Array, unit: float = 1.0) -> Response:
+    """Of a model with the covariance of its theta. unit: of y over that of v."""
+    scale = np.append(np.full(found.structure.numerator_taps, unit * VAGUE),
+                      np.full(found.structure.free_poles, VAGUE))
+    return Response(unit * found.numerator, np.append(1.0, found.a), found.structure.integrator,
+                    covariance[3:, 3:] * np.outer(scale, scale))
+
+
+def least_response(best: Model, rivals: Sequence[Model] = ()) -> Model:
+    """The model to take. rivals: with other delays, that fit alike."""
+    if best.structure.numerator_taps < 2:
+        return best  # a gain is the same at every frequency
+    own = response_of(best, covariance_of(best.problem, best.fit))
+    silent = own.known_up_to < GRID
+    if not silent.any():
+        for one in rivals:
+            later = np.exp(-1j * GRID * (one.structure.delay - best.structure.delay))
+            other = response_of(one, np.zeros_like(one.fit.cov))
+            silent |= np.abs(other.at(GRID) * later / own.at(GRID) - 1.0) > SILENT
+    if not silent.any():
+        return best
+    return min((_smoothed(one, GRID[silent], best.squares / effective(best.left))
+                for one in (best, *rivals)),
+               key=lambda one: float(np.sum((_rows(one, GRID[silent]) @ one.numerator) ** 2)))
+
+
+def _rows(found: Model, silent: Array) -> Array:
+    """Rows whose product with B is G at these frequencies, real and imaginary parts."""
+    back = np.exp(-1j * silent)
+    rows = back[:, None] ** np.arange(found.structure.numerator_taps) \
+        / np.abs(polyval(back, found.denominator))[:, None]
+    return np.vstack([rows.real, rows.imag])
+
+
+def _smoothed(found: Model, silent: Array, noise_variance: float) -> Model:
+    """The least of these gains within two deviations: the heaviest weight on them that stays there.
+    """
+    covariance = covariance_of(found.problem, found.fit)
+    rows = np.zeros((2 * len(silent), len(covariance)))
+    rows[:, 3:3 + found.structure.numerator_taps] = VAGUE * _rows(found, silent)
+    pull = covariance @ rows.T @ rows
+    for weight in 1e6 / max(float(np.trace(pull)), 1e-300) * 0.0625 ** np.arange(12.0):
+        theta = np.linalg.solve(np.eye(len(pull)) + weight * pull, found.fit.theta)
+        fit = replace(found.fit, theta=theta)
+        if not np.isfinite(found.structure.at(fit.xi)).all():
+            continue  # a pole has left the unit circle
+        smooth = Model(found.structure, found.problem, replace(fit, x=found.problem.state(fit)))
+        if smooth.squares <= found.squares + 4.0 * noise_variance:
+            return smooth
+    return found

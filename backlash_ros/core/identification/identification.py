@@ -15,9 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.fit import FIRST_STEPS
-from backlash_ros.core.identification.deviations import covariance_of, effective, lag_one
-from backlash_ros.core.identification.order_selection import PLATEAU, equal_delays
-from backlash_ros.core.identification.response import least_response, response_of
+from backlash_ros.core.identification.deviations import (
+    covariance_of,
+    effective,
+    lag_one,
+    least_response,
+    response_of,
+)
 from backlash_ros.core.identification.result import Details, HeldOut, Identification, Options
 from backlash_ros.core.identification.structure import (
     TINY,
@@ -30,10 +34,12 @@ from backlash_ros.core.identification.structure import (
 )
 from backlash_ros.core.identification.structure_search import (
     EARLY,
-    POLES,
+    GENERAL_POLES,
+    PLATEAU,
     Progress,
     StructureSearch,
     Units,
+    equal_delays,
     later,
     observed_of,
     searched,
@@ -75,9 +81,9 @@ def identify(
             replace(best.structure, delay=delay) for delay in equal_delays(s.compared, s.chosen))
     ]
     # With as many poles, some of them may fit worse.
-    best, beside = least_response(s.samples, best, [
+    best = least_response(best, [
         one for one in others if one.structure != best.structure and rows * log(
-            max(one.squares, TINY) / max(best.squares, TINY)) <= PLATEAU], best.squares / rows)
+            max(one.squares, TINY) / max(best.squares, TINY)) <= PLATEAU])
     samples = s.samples
     if len(v) > len(samples.v):
         progress('fitting the whole record')
@@ -85,11 +91,12 @@ def identify(
         whole[part] = samples.y
         samples = replace(samples, v=v, y=whole, last=len(v))
         begin = moved_to(best.structure, best, p0=float(v[0]) + 0.5 * best.gap)
-        best = fitted(samples, best.structure, begin, FIRST_STEPS, beside)
+        best = fitted(samples, best.structure, begin, FIRST_STEPS)
         kept = without_outliers(samples, best)
         if kept is not samples:
             samples = kept
-            best = fitted(samples, best.structure, best.fit, beside=beside)
+            best = fitted(samples, best.structure, best.fit)
+        best = least_response(best)
     progress('judging')
     given = replace(given, outliers=int((np.isfinite(given.y) & np.isnan(samples.y)).sum()))
     s = s._replace(samples=samples, best=best, held_out=s.held_out._replace(
@@ -103,7 +110,7 @@ def _why_nothing(v: Array, y: Array, options: Options) -> str:
     # The first samples of them are fitted alone, to predict the others.
     fitted = known[:len(known) - round(options.held_out * len(known))]
     needed = 8 * max(Structure(max(options.orders), 0, False).unknowns,
-                          Structure(POLES, 0, False).unknowns)
+                          Structure(GENERAL_POLES, 0, False).unknowns)
     if fitted.sum() < needed or not known[len(fitted):].any():
         return (
             f'{int(known.sum())} samples of y are too few, or lie too unevenly, for an order of up '

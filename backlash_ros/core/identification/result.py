@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from math import nan
+from math import inf, nan
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.identification.order_selection import Compared
-from backlash_ros.core.identification.response import Response
+from backlash_ros.core.identification.deviations import Response
+from backlash_ros.core.identification.structure import Model, Structure
 from backlash_ros.core.identification.verdict import Verdict
 from backlash_ros.core.plant.actuator import Actuator
 
@@ -29,6 +29,22 @@ class Options:
     integrators: Sequence[bool] = (False, True)
     slope: float = 1.0
     held_out: float = 1.0 / 3.0
+
+
+class Compared(NamedTuple):
+    """One structure.
+
+    trained: fitted to the first part, with which held_out, the rms of the error on the last part,
+    is made; scatter: relative deviation of that. whole: fitted to all samples. criterion: of the
+    search, the smaller the better, inf where it was not fitted to the end.
+    """
+
+    structure: Structure
+    held_out: float
+    trained: Model
+    whole: Model
+    criterion: float = inf
+    scatter: float = 0.0
 
 
 class HeldOut(NamedTuple):

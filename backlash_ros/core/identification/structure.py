@@ -143,16 +143,13 @@ class Samples:
         """The y that are fitted (M,)."""
         return self.y[self.first:self.last]
 
-    def problem(self, structure: Structure, beside: Prior | None = None) -> Problem:
-        """The fit of a structure. beside: more rows on theta that are to hold."""
+    def problem(self, structure: Structure) -> Problem:
+        """The fit of a structure."""
         held = 1e6  # weight of m = 1, which is in B
         begin = self.first - 1 - structure.delay
-        rows: Array = held * np.eye(1, 3 + structure.count)
-        values: Array = np.full(1, held)
-        if beside is not None:
-            rows, values = np.vstack([rows, beside.rows]), np.append(values, beside.values)
+        prior = Prior(held * np.eye(1, 3 + structure.count), np.full(1, held))
         return Problem(structure, self.v[begin:begin + self.count], self.fitted_y(), 1e-12,
-                       Prior(rows, values), step=self.step)
+                       prior, step=self.step)
 
 
 @dataclass(frozen=True)
@@ -217,10 +214,9 @@ class Model:
 
 def fitted(
     samples: Samples, structure: Structure, begin: WindowFit, steps: int = STEPS,
-    beside: Prior | None = None,
 ) -> Model:
     """The best values nearest to some."""
-    problem = samples.problem(structure, beside)
+    problem = samples.problem(structure)
     # As much noise as there is motion hides nothing from the first step.
     begin = replace(begin, step=0.0, noise_std=max(begin.noise_std, 1e-12))
     with suppress(np.linalg.LinAlgError):  # what has no finite posterior stays as it began

@@ -2,11 +2,23 @@
 
     the gap with a general G  ->  orders, delays, integrators on held-out samples
     ->  the gap again with the one that is taken  ->  later delays, where these fit as well
+
+A structure with taps for all delays bounds what each of its delays can explain: those that cannot
+be the best are left out. A pole that a zero cancels is none: such a structure gives way to the same
+one without that pole, for it would predict only what no G makes. Structures whose held-out error is
+within a few percent of the least, or within its own deviation, are equally good predictors. Among
+them the least
+
+    N' log(squares) + unknowns log(N)
+
+over all samples is taken (BIC), with N' = N (1 - r) / (1 + r) for the lag-1 correlation r of the
+residual. No error is less than what the simulation rounds. A structure with an oscillation that
+outlasts the record is taken only where all have one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from math import exp, inf, log, nan, sqrt
 from typing import NamedTuple
@@ -20,15 +32,7 @@ from backlash_ros.core.estimation.search import search
 from backlash_ros.core.estimation.settings import ROWS
 from backlash_ros.core.identification.deviations import by_model, effective
 from backlash_ros.core.identification.not_play import Observed, what_it_is
-from backlash_ros.core.identification.order_selection import (
-    Compared,
-    compare,
-    eligible,
-    gives_way,
-    predicted,
-    selected,
-)
-from backlash_ros.core.identification.result import HeldOut, Options
+from backlash_ros.core.identification.result import Compared, HeldOut, Options
 from backlash_ros.core.identification.structure import (
     TINY,
     Model,
@@ -37,18 +41,20 @@ from backlash_ros.core.identification.structure import (
     first_model,
     fitted,
     moved_to,
+    with_pole,
 )
 from backlash_ros.core.identification.verdict import ANOTHER
+from backlash_ros.core.plant.numerics import lfilter
 from backlash_ros.core.records.readings import quantum
 from backlash_ros.core.records.samples import noise_of, outliers
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], object]
 
-POLES = 3  # of the general G with which the gap is searched first; it has a tap for each delay
 EARLY, LONGEST_DELAY = (0, 1, 2, 3), 40  # delays that are compared first, and the longest
-ALIKE = 5.0  # log-likelihood by which a delay that fits alike may be worse
-SMALLEST_GAP = 2e-3  # that is searched for, over the swing of v
+GENERAL_POLES = 3  # of the G with which the gap is searched first; it has a tap for each delay
+PLATEAU = 10.0  # difference of the criterion below which two delays are equally good
+RACE_STEPS = 10  # of a fit that tells whether a structure may be the best
 
 
 class Units(NamedTuple):
@@ -80,18 +86,19 @@ class StructureSearch(NamedTuple):
 
 def searched(
     v: Array, y: Array, options: Options, delays: Sequence[int], progress: Progress,
-    step: float | None = None,
 ) -> StructureSearch:
-    """The best structure with one of these delays. step: of the readings, None: told from them."""
+    """The best structure with one of these delays."""
     far_off = 0.03  # relative distance of the last gap from the first, with which to begin anew
     progress('searching the gap')
-    samples = Samples(v, y, max(delays) + 1, len(v), step_of(y) if step is None else step)
-    cut = samples.last - round(options.held_out * samples.count)
+    samples = Samples(v, y, max(delays) + 1, len(v), step_of(y))
     found = _with_general(samples, delays)
     kept = without_outliers(samples, found[0])
-    if kept is not samples:
+    # Where rounding is the least of what is left, readings are no intervals.
+    kept = replace(kept, step=samples.step * (found[0].rms <= samples.step))
+    if kept.y is not samples.y or kept.step != samples.step:
         samples = kept
         found = _with_general(samples, delays)
+    cut = samples.last - round(options.held_out * samples.count)
     candidates = found[:2]
     structures = [
         Structure(order, delay, integrator) for integrator in options.integrators
@@ -112,8 +119,6 @@ def searched(
         if not again or abs(best.gap - candidates[0].gap) <= far_off * best.gap:
             break
         candidates = [best, candidates[0]]  # the general G may have been a poor one
-    if best.rms > samples.step > 0.0:  # rounding is the least of what is left
-        return searched(v, y, options, delays, progress, 0.0)
     rows = effective(best.left)
     rivals = sorted(
         (0.5 * rows * log(max(one.squares, TINY) / max(best.squares, TINY)), one.gap)
@@ -130,7 +135,8 @@ def searched(
 
 def _with_general(samples: Samples, delays: Sequence[int]) -> list[Model]:
     """Models of different gaps, the best first, with a few poles and a tap for each delay."""
-    general = Structure(POLES, min(delays), False, POLES + max(delays) - min(delays))
+    general = Structure(
+        GENERAL_POLES, min(delays), False, GENERAL_POLES + max(delays) - min(delays))
     swing = float(np.ptp(samples.v))
     begins = sorted((
         first_model(samples, general, gap, float(samples.v[0]) + 0.5 * gap)
@@ -138,22 +144,22 @@ def _with_general(samples: Samples, delays: Sequence[int]) -> list[Model]:
     ), key=lambda one: one.squares)
     rough = [fitted(samples, general, one.fit, FEW_STEPS) for one in begins[:2]]
     best = min(rough, key=lambda one: one.squares)
-    for _ in range(2):
-        models, _ = _of_gaps(samples, best)
-        if models[0].squares > 0.9 * best.squares:
-            break
-        best = models[0]
+    models, _ = _of_gaps(samples, best)
+    # Around another G the search may find another gap.
+    if models[0].squares < 0.9 * best.squares and abs(models[0].gap - best.gap) > 0.1 * best.gap:
+        models, _ = _of_gaps(samples, models[0])
     return models
 
 
 def _of_gaps(samples: Samples, like: Model) -> tuple[list[Model], tuple[Array, Array]]:
     """Fits of the same structure to the minima over the gap, the best first; the profile."""
     most, apart = 4, 0.005  # minima that are fitted, and the relative distance of different ones
+    smallest = 2e-3  # gap that is searched for, over the swing of v
     structure, problem = like.structure, like.problem
     y = np.where(problem.known, problem.y, nan)
     swing = float(np.ptp(problem.v))
     hypotheses, _ = search(structure, problem.v, y, 1e-12, 0.98 * swing,
-                           like.fit.theta[3:], SMALLEST_GAP)
+                           like.fit.theta[3:], smallest)
     begins, gaps = [like.fit], [like.gap]
     for _, gap, p0, _ in hypotheses:
         if len(begins) <= most and all(abs(gap - other) > ANOTHER * other for other in gaps):
@@ -190,12 +196,183 @@ def without_outliers(samples: Samples, found: Model) -> Samples:
     return replace(samples, y=y)
 
 
+def compare(
+    samples: Samples, candidates: Sequence[Model], structures: Sequence[Structure], cut: int,
+) -> list[Compared]:
+    """Fit the structures, from models whose gap and beginning are about right.
+
+    Some steps on the first part tell which structures may be the best; only these are fitted to
+    the end. cut: number of the first sample that is held out.
+    """
+    train, later = replace(samples, last=cut), replace(samples, first=cut)
+    of_kinds = [[s for s in structures if (s.integrator, s.order) == kind]
+                for kind in sorted({(s.integrator, s.order) for s in structures})]
+    likes = [_of_all_delays(train, kind, candidates) for kind in of_kinds]
+    best = min(likes, key=lambda one: one.squares)
+    rows, count = effective(best.left), len(best.left)
+    least = 1e-12 * count  # squares below which a fit is not done yet, y having a deviation of 1
+
+    def criterion(squares: float, structure: Structure) -> float:
+        return rows * log(max(squares, least)) + structure.unknowns * log(count)
+
+    first: dict[Structure, Compared] = {}
+    reached = inf
+    for bound, k in sorted(
+            (criterion(like.squares, of_kinds[k][0]), k) for k, like in enumerate(likes)):
+        if bound > reached + PLATEAU:
+            break
+        for structure in of_kinds[k]:
+            like = likes[k]
+            taps = like.numerator[structure.delay - like.structure.delay:]
+            begin = replace(like.fit, theta=np.concatenate([
+                like.fit.theta[:3], structure.xi(taps, like.a)]), x=np.zeros(1))
+            found = fitted(train, structure, begin, RACE_STEPS)
+            first[structure] = _compared(found, found, later)
+            reached = min(reached, criterion(found.squares, structure))
+    done: dict[Structure, Compared] = {}
+    for structure in sorted(_finalists(_with_criteria(first.values())), key=lambda s: s.order):
+        trained = first[structure].trained
+        begins = [trained.fit]
+        smaller = done.get(replace(structure, order=structure.order - 1))
+        if smaller is not None:
+            begins += [with_pole(structure, smaller.trained, pole) for pole in (0.3, 0.85)]
+        some = [fitted(train, structure, begin, FIRST_STEPS) for begin in begins]
+        trained = min(some, key=lambda one: one.squares)
+        done[structure] = _compared(trained, fitted(samples, structure, trained.fit), later)
+    finished = {one.structure: one for one in _with_criteria(done.values())}
+    return [finished.get(structure, one) for structure, one in first.items()]
+
+
+def _of_all_delays(
+    samples: Samples, structures: Sequence[Structure], candidates: Sequence[Model],
+) -> Model:
+    """A model with the poles of these structures, and a tap for each of their delays."""
+    delays = [s.delay for s in structures]
+    one = structures[0]
+    general = replace(one, delay=min(delays), taps=one.numerator_taps + max(delays) - min(delays))
+    begins = [first_model(samples, general, one.gap, one.fit.p0) for one in candidates]
+    best = min(begins, key=lambda model: model.squares)
+    return fitted(samples, general, best.fit, RACE_STEPS)
+
+
+def _compared(trained: Model, whole: Model, later: Samples) -> Compared:
+    error = (later.fitted_y() - predicted(trained, later))[np.isfinite(later.fitted_y())]
+    rms = float(np.sqrt(np.mean(error**2)))
+    return Compared(whole.structure, rms if np.isfinite(rms) else inf, trained, whole,
+                    scatter=1.0 / sqrt(2.0 * effective(error)))
+
+
+def _with_criteria(compared: Iterable[Compared]) -> list[Compared]:
+    """The same with their criteria, and no error less than what is rounded."""
+    compared = list(compared)
+    best = min((one.whole for one in compared), key=lambda whole: whole.squares)
+    count, rows, rounded = len(best.left), effective(best.left), rounding(best)
+    return [one._replace(
+        held_out=max(one.held_out, rounded),
+        criterion=rows * log(max(one.whole.squares, rounded**2 * count, TINY))
+        + one.structure.unknowns * log(count),
+    ) for one in compared]
+
+
+def _finalists(first: Sequence[Compared]) -> list[Structure]:
+    """Structures that may be the best by either measure, with those that they may give way to."""
+    finalists = 4  # by the criterion, and as many by prediction
+    by_criterion = sorted(first, key=lambda one: one.criterion)
+    by_prediction = sorted(first, key=lambda one: one.held_out)
+    good = {one.structure for one in (*by_criterion[:finalists], *by_prediction[:finalists])}
+    good |= {replace(by_criterion[0].structure, delay=one.structure.delay) for one in first}
+    for _ in range(2):  # what they give way to may have a pole that is cancelled as well
+        good |= {Structure(s.order - 1, s.delay, also)
+                 for s in good for also in (False, s.integrator)}
+    return [one.structure for one in first if one.structure in good]
+
+
+def selected(compared: Sequence[Compared]) -> Compared:
+    """The structure that is taken."""
+    open_ = eligible(compared)
+    needed = [one for one in open_ if not gives_way(one.whole, open_)]
+    least = min(needed, key=lambda one: one.held_out)
+    within = least.held_out * max(1.05, 1.0 + least.scatter)
+    return min((one for one in needed if one.held_out <= within), key=lambda one: one.criterion)
+
+
+def eligible(compared: Sequence[Compared]) -> list[Compared]:
+    """Structures that were fitted to the end, without those that ring if there are others."""
+    fitted_to_end = [one for one in compared if np.isfinite(one.criterion)]
+    return [one for one in fitted_to_end if not rings(one.whole)] or fitted_to_end
+
+
+def rings(found: Model) -> bool:
+    """Whether an oscillation hardly dies out over the record: it explains what G does not."""
+    lasting = 4.0  # time constants that a record has to be long
+    poles = np.roots(np.append(1.0, found.a))
+    return bool(np.any((poles.imag != 0.0) & (abs(poles) > 1.0 - lasting / len(found.problem.v))))
+
+
+def gives_way(found: Model, compared: Sequence[Compared]) -> bool:
+    """Whether a zero cancels a pole, and the structure without that pole is compared as well."""
+    s = found.structure
+    smaller = [
+        Structure(s.order - 1, s.delay, s.integrator and pole != 1.0)
+        for pole in cancelled_poles(found)
+    ]
+    # One that explains far less has been fitted badly.
+    return any(one.structure in smaller and one.whole.squares <= 2.0 * found.squares
+               for one in compared)
+
+
+def cancelled_poles(found: Model) -> list[complex]:
+    """Poles that a zero all but cancels, so that neither shows; an integrator as exactly 1."""
+    if not np.isfinite(found.numerator).all():
+        return []
+    zeros = np.roots(found.numerator)
+    poles = [*np.roots(np.append(1.0, found.a)), *[1.0] * found.structure.integrator]
+    # Within 2 % of the distance of the pole from 1; a zero at 1 cancels an integrator.
+    return [
+        complex(pole) for pole in poles
+        if float(np.abs(zeros - pole).min(initial=inf)) < 0.02 * max(abs(1.0 - pole), 0.01)
+    ]
+
+
+def rounding(found: Model) -> float:
+    """Deviation of the simulated y, and of one that was measured in a simulation, by rounding.
+
+    A step of the recursion A y = ... rounds by |A|_1 |y| eps at most, and 1/A hands that on.
+    """
+    impulse = np.zeros(len(found.problem.v))
+    impulse[0] = 1.0
+    answer = lfilter([1.0], found.denominator, impulse)
+    y = float(np.sqrt(np.mean(found.problem.y**2)))
+    size = float(np.abs(found.denominator).sum() * np.linalg.norm(answer))
+    return 2.0 * float(np.finfo(float).eps) * y * size
+
+
+def equal_delays(compared: Sequence[Compared], chosen: Compared) -> list[int]:
+    """Delays that explain y as well as the chosen one, with as many poles or more.
+
+    A lag that a pole of its own would make may stand for a delay.
+    """
+    taken = chosen.structure
+    return sorted({
+        one.structure.delay for one in compared
+        if one.structure.integrator == taken.integrator and one.structure.order >= taken.order
+        and one.criterion <= chosen.criterion + PLATEAU
+    })
+
+
+def predicted(found: Model, later: Samples) -> Array:
+    """Simulation over samples (M,), begun in the state and with the offset that fit them best."""
+    begin = replace(found.fit, x=np.zeros(1), p0=float(found.p[-1]))
+    return later.problem(found.structure).explained(begin)
+
+
 def later(early: StructureSearch, options: Options, progress: Progress) -> StructureSearch:
     """The search among later delays, where one of them explains y as well or better.
 
     The same structure is fitted with one sample of delay more and more, from the fit before.
     """
     worse_for = 3  # delays in a row that fit worse, behind which no later one is tried
+    alike_by = 5.0  # log-likelihood by which a delay that fits alike may be worse
     progress('searching later delays')
     best, latest = early.best, min(LONGEST_DELAY, len(early.samples.v) // 20)
     samples = replace(early.samples, first=latest + 1)
@@ -208,7 +385,7 @@ def later(early: StructureSearch, options: Options, progress: Progress) -> Struc
             samples, structure, before.gap, before.fit.p0, (0.6,)).fit]
         scan.append(min((fitted(samples, structure, begin, FIRST_STEPS) for begin in begins),
                         key=lambda one: one.squares))
-        most = min(one.squares for one in scan) * exp(2.0 * ALIKE / rows)
+        most = min(one.squares for one in scan) * exp(2.0 * alike_by / rows)
         alike = [one for one in scan if one.squares <= most]
     first, last = (alike[k].structure.delay for k in (0, -1))
     if last <= EARLY[-1]:

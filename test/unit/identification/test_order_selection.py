@@ -10,15 +10,14 @@ from scipy.signal import lfilter
 from backlash_ros.core.estimation.posterior import WindowFit
 from backlash_ros.core.identification.identification import identify
 from backlash_ros.core.identification.motion import strokes
-from backlash_ros.core.identification.order_selection import (
+from backlash_ros.core.identification.result import Options
+from backlash_ros.core.identification.structure import Model, Samples, Structure
+from backlash_ros.core.identification.structure_search import (
     Compared,
     cancelled_poles,
     gives_way,
     selected,
 )
-from backlash_ros.core.identification.result import Options
-from backlash_ros.core.identification.structure import Model, Samples, Structure
-from backlash_ros.core.plant.backlash import play
 
 SAMPLES = Samples(np.zeros(2), np.full(2, np.nan), 1, 2, 0.0)
 
