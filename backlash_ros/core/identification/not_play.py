@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 Figures = dict[str, float | str] | None
 
 LAG_LENGTHS = (0.7, 2.0, 6.0, 20.0, 60.0)  # [samples]
-EXPLAINED = 0.6  # share of what a play leaves beyond the noise that another one must explain
+EXPLAINED = 0.95  # share of what a play leaves beyond the noise that another one must explain
 REST = 8  # samples of v at rest, behind as many in which y settles
 
 

@@ -3,11 +3,9 @@
     the gap with a general G  ->  orders, delays, integrators on held-out samples
     ->  the gap again with the one that is taken  ->  later delays, where these fit as well
 
-A structure with taps for all delays bounds what each of its delays can explain: those that cannot
-be the best are left out. A pole that a zero cancels is none: such a structure gives way to the same
-one without that pole, for it would predict only what no G makes. Structures whose held-out error is
-within a few percent of the least, or within its own deviation, are equally good predictors. Among
-them the least
+A pole that a zero cancels is none: such a structure gives way to the same one without that pole,
+for it would predict only what no G makes. Structures whose held-out error is within a few percent
+of the least, or within its own deviation, are equally good predictors. Among them the least
 
     N' log(squares) + unknowns log(N)
 
@@ -207,28 +205,15 @@ def compare(
     train, later = replace(samples, last=cut), replace(samples, first=cut)
     of_kinds = [[s for s in structures if (s.integrator, s.order) == kind]
                 for kind in sorted({(s.integrator, s.order) for s in structures})]
-    likes = [_of_all_delays(train, kind, candidates) for kind in of_kinds]
-    best = min(likes, key=lambda one: one.squares)
-    rows, count = effective(best.left), len(best.left)
-    least = 1e-12 * count  # squares below which a fit is not done yet, y having a deviation of 1
-
-    def criterion(squares: float, structure: Structure) -> float:
-        return rows * log(max(squares, least)) + structure.unknowns * log(count)
-
     first: dict[Structure, Compared] = {}
-    reached = inf
-    for bound, k in sorted(
-            (criterion(like.squares, of_kinds[k][0]), k) for k, like in enumerate(likes)):
-        if bound > reached + PLATEAU:
-            break
-        for structure in of_kinds[k]:
-            like = likes[k]
+    for kind in of_kinds:
+        like = _of_all_delays(train, kind, candidates)
+        for structure in kind:
             taps = like.numerator[structure.delay - like.structure.delay:]
             begin = replace(like.fit, theta=np.concatenate([
                 like.fit.theta[:3], structure.xi(taps, like.a)]), x=np.zeros(1))
             found = fitted(train, structure, begin, RACE_STEPS)
             first[structure] = _compared(found, found, later)
-            reached = min(reached, criterion(found.squares, structure))
     done: dict[Structure, Compared] = {}
     for structure in sorted(_finalists(_with_criteria(first.values())), key=lambda s: s.order):
         trained = first[structure].trained
