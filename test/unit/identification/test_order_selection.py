@@ -18,6 +18,7 @@ from backlash_ros.core.identification.structure_search import (
     gives_way,
     selected,
 )
+from backlash_ros.core.plant.backlash import play
 
 SAMPLES = Samples(np.zeros(2), np.full(2, np.nan), 1, 2, 0.0)
 
