@@ -1,27 +1,33 @@
 """An arm with play in six joints: each identified alone, then all of them on a trajectory.
 
-    python benchmarks/arm_of_physics.py [--files DIR] [--passes 2]
+    python benchmarks/arm_of_physics.py [--files DIR] [--passes 2] [--write]
 
 Everything is in one process and in simulated time: the arm of examples/arm_physics.py, encoders of
 12 bits, commands in whole steps of them, which the driver reports. `identify` gets a record of each
 joint, moved as `identify --drive` moves it; one controller goes on with the files that it writes,
 on the trajectory of examples/joint_trajectory.py. --files: keeps those files, and uses those that
-are there.
+are there. --write: makes the film of
+docs/arm.md, with libOSMesa (apt-get install libosmesa6) where there is no display.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from PIL import Image
 from reporting import ROOT, text_table
 
 sys.path.append(str(ROOT / 'examples'))
+os.environ.setdefault('MUJOCO_GL', 'osmesa')  # mujoco reads it when it is imported
 
 from arm_physics import JOINTS, RESOLUTION, ArmPhysics, Joint
 from joint_trajectory import swing
@@ -33,6 +39,7 @@ from backlash_ros.core.loop.joint_loops import JointLoops
 from backlash_ros.core.loop.sample_counter import Output, SampleCounter
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.tools.config import read_configuration
+from backlash_ros.tools.figures import TIME_LABEL, curve, label
 from backlash_ros.tools.identify.command import main as identify
 
 Array = NDArray[np.float64]
@@ -42,6 +49,8 @@ REACH, SPEED, DRIVE_S = 0.2, 0.08, 120.0  # for identify [rad], [rad/s]: no link
 KNOWN_OF_SERVOS = ('--order', '1', '--integrator', 'no')  # position loops in slow motion
 OF_A_JOINT = ('plant.', 'estimator.', 'tracking.', 'control.delay_samples')  # of identified.yaml
 NAMES = [joint.name for joint in JOINTS]
+FILM = ROOT / 'docs' / 'images' / 'arm.gif'
+FRAME_S, COLOURS, VIEW_AT = 0.16, 48, (0.12, 0.0, 0.2)  # of the film
 
 
 class Motion(NamedTuple):
@@ -49,11 +58,13 @@ class Motion(NamedTuple):
 
     errors (N, 6): of the joints [rad], and tip (N,): distance of the tip [m] from where it belongs,
     for references as late as the loops follow them. gaps (N, 6): as estimated [rad].
+    poses (N, 12): of motors and joints, as the physics have them [rad].
     """
 
     errors: Array
     tip: Array
     gaps: Array
+    poses: Array
 
 
 def shared_parameters() -> dict[str, object]:
@@ -112,11 +123,12 @@ def move(p: Parameters, passes: int) -> Motion:
         p, v.update, lambda name: Driver(lambda: now_ns),
         {name: before(p.of_joint(name)) for name in NAMES}, SampleCounter(period_s), dict(v),
     )
-    references, positions, gaps = [], [], []
+    references, positions, gaps, poses = [], [], [], []
     for k in range(round(passes * PERIOD_S / period_s)):
         now_ns = round((1.0 + k * period_s) * 1e9)
         references.append([swing(k * period_s, i, AMPLITUDE, PERIOD_S) for i in range(len(v))])
         positions.append(arm.links)
+        poses.append(arm.data.qpos.copy())
         loops.take_references(dict(zip(NAMES, references[-1], strict=True)))
         loops.answer({
             name: Output(y, now_ns, now_ns, now_ns, k, numbered=False)
@@ -137,7 +149,7 @@ def move(p: Parameters, passes: int) -> Motion:
     tip = np.array([
         np.linalg.norm(arm.tip_at(a) - arm.tip_at(b)) for a, b in zip(where, wanted, strict=True)
     ])
-    return Motion(where - wanted, tip, np.array(gaps))
+    return Motion(where - wanted, tip, np.array(gaps), np.array(poses))
 
 
 def in_steps(v: float) -> float:
@@ -150,12 +162,49 @@ def rms(values: Array) -> Array:
     return np.sqrt(np.mean(values**2, axis=0))
 
 
+def film(without: Motion, learned: Motion, pass_of: int) -> None:
+    """The last pass: the arm, and how far its tip is from where it belongs, with and without."""
+    import mujoco  # what it draws with is known by now
+
+    drawn, step = ArmPhysics(), round(FRAME_S * pass_of / PERIOD_S)
+    data, camera = mujoco.MjData(drawn.model), mujoco.MjvCamera()
+    camera.lookat, camera.distance, camera.azimuth, camera.elevation = VIEW_AT, 0.75, 130.0, -15.0
+    frames = []
+    t = np.arange(pass_of) * PERIOD_S / pass_of
+    with mujoco.Renderer(drawn.model, 320, 320) as renderer:
+        for k in range(0, pass_of, step):
+            data.qpos[:] = learned.poses[k - pass_of]
+            mujoco.mj_forward(drawn.model, data)
+            renderer.update_scene(data, camera)
+            figure = Figure(figsize=(8.0, 3.4), dpi=80, layout='tight')
+            view, axes = figure.subplots(1, 2, width_ratios=(2, 3))
+            picture = renderer.render()
+            view.imshow(np.where(picture.any(-1, keepdims=True), picture, 255))
+            view.axis('off')
+            for motion, colour, name in ((without, 'tab:red', 'gaps taken for 0'),
+                                         (learned, 'tab:blue', 'gaps identified and learned')):
+                tip = 1e3 * motion.tip[-pass_of:]
+                curve(axes, t, tip, colour, name)
+                axes.plot(t[k], tip[k], 'o', color=colour)
+            label(axes, 'Tip from where it belongs', 'distance [mm]', TIME_LABEL)
+            axes.legend(loc='upper right')
+            axes.set_ylim(0.0, 14.0)
+            canvas = FigureCanvasAgg(figure)
+            canvas.draw()
+            frames.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert('RGB'))
+    palette = frames[0].quantize(COLOURS)
+    pictures = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    pictures[0].save(FILM, save_all=True, append_images=pictures[1:], loop=0, optimize=True,
+                     duration=round(1e3 * FRAME_S))
+
+
 def main() -> None:
     """Print what each joint and the tip come to."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--files', type=Path)
     parser.add_argument('--passes', type=int, default=2)
+    parser.add_argument('--write', action='store_true')
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = options.files or Path(name)
@@ -168,7 +217,11 @@ def main() -> None:
             move(Parameters(each), options.passes)
             for each in (with_gaps(values, 0.0), with_gaps(values, 1.0), values)
         )
-    print(table(without, known, learned, round(PERIOD_S / Parameters(values).sample_period)))
+    period_s = Parameters(values).sample_period
+    pass_of = round(PERIOD_S / period_s)
+    print(table(without, known, learned, pass_of))
+    if options.write:
+        film(without, learned, pass_of)
 
 
 def table(without: Motion, known: Motion, learned: Motion, pass_of: int) -> str:
