@@ -76,7 +76,7 @@ class Trial(NamedTuple):
         Twice as long where it did not hold for long: what contradicts one explanation after the
         other is no backlash.
         """
-        longer = min(2 * self.must, settings.LIVELY)
+        longer = min(2 * self.must, settings.MOST_PREDICTED)
         return self._replace(must=longer if self.lasts else settings.PREDICTED)
 
 

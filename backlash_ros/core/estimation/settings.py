@@ -25,12 +25,14 @@ OUTLIER_SHARE = 0.2  # of a block or record, up to which readings beyond the gat
 MISFIT = 3.0  # mean square of normalised residuals of a block that contradicts an estimate
 AS_GOOD = 1.5  # ratio of residuals up to which another explanation is as good
 PREDICTED = 30  # samples that an explanation must predict after one that was contradicted
+MOST_PREDICTED = 1000  # as many at most: twice as many as the last one if that did not last
 LASTING = 8.0  # times what it had to predict, over which an explanation holds for long
 
 # --- how much is looked at
 FIRST_FIT = 20  # samples before the first search
 SHORT_RECORD = 400  # samples of a record in which other gaps are looked for again
-GROWTH = 1.25  # of the record from one search to the next; to the third power after many reversals
+GROWTH = 1.25  # of the record from one search to the next
+SEARCHED = 2.0  # of one of many reversals that a search has not explained
 BLOCKS = 16  # refits while the record doubles: one for so many of its samples
 FEWEST = 8  # samples between two refits
 LIVELY = 1500  # samples that are kept though fewer hold enough reversals

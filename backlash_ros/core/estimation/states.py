@@ -92,7 +92,7 @@ def _searching(setup: Setup, record: Window, before: Belief) -> Belief:
         return replace(before, end=record.end, next_at=soon)
     # What many reversals do not tell, a few more will not.
     lasting = tried is not None and tried.left.turns >= settings.HELD_REVERSALS
-    growth = settings.GROWTH ** (3 if lasting else 1)
+    growth = settings.SEARCHED if lasting else settings.GROWTH
     search_at = record.end + max(int(count * (growth - 1.0)), FEWEST)
     found = afresh(setup, record, also=tried, walks=True)
     part = shorter = record
