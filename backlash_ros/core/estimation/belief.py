@@ -151,7 +151,8 @@ def _beside_inherited(setup: Setup, belief: Belief, fit: WindowFit, known: Known
     gap = known.crossings[1] - known.crossings[2]
     of_motion = (settings.LOST_MOTION * gap) ** 2 / 2.0
     prior = known.cov + 1e-18 * np.diag(known.crossings**2 + gap**2)
-    if not agree(fit.crossings, known.crossings, cov + prior):
+    as_told = agree(fit.crossings, known.crossings, cov + prior)
+    if not as_told:
         prior = prior + np.diag([(0.01 * known.crossings[0]) ** 2, of_motion, of_motion])
     if not agree(fit.crossings, known.crossings, cov + prior):
         std = sqrt(fit.gap_std**2 + 2.0 * doubt)
@@ -163,8 +164,8 @@ def _beside_inherited(setup: Setup, belief: Belief, fit: WindowFit, known: Known
         return replace(belief, reason=Status.INCONSISTENT)
     gain = prior @ np.linalg.pinv(cov + prior)
     joined = Known(known.crossings + gain @ (fit.crossings - known.crossings), prior - gain @ prior)
-    if np.trace(joined.cov[1:, 1:]) > np.trace(known.cov[1:, 1:]):
-        joined = known  # agreement makes nothing less certain
+    if not as_told and fit.systematic:
+        joined = known  # what explains y no better is no reason to move
     unexplained = moves_unexplained(setup, fit)
     return replace(belief, published=joined,
                    reason=Status.INCONSISTENT if unexplained else Status.TRACKING)
