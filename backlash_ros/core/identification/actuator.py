@@ -36,7 +36,7 @@ def with_actuator(found: Identification, commands: Array) -> Identification:
     off = float(np.sqrt(np.mean((found.v - commands)**2)))
     if details is None or off <= negligible * gap:
         return found
-    place, begin = (details.p - details.v) / gap, details.first - 1 - found.delay
+    place, begin = (details.p - details.v) / gap, details.first - 1 - found.model.delay
     side = np.zeros(len(found.v))
     side[begin:begin + len(place)] = (place < 1e-9) * 1.0 - (place > 1.0 - 1e-9)
     pushed = side != 0.0
@@ -53,11 +53,12 @@ def with_actuator(found: Identification, commands: Array) -> Identification:
                             default=(0.0, off, None), key=lambda one: one[0])
     if actuator is not None and left <= poor * gap:
         return replace(found, actuator=actuator)
-    return replace(found, remarks=(
+    assert found.verdict is not None
+    return replace(found, fit=(details, found.verdict._replace(remarks=(
         *found.remarks,
         f'applied_control is off control by {left / gap:.0%} of the gap (rms) that no lag '
         'explains, and y will follow worse for it: stay within what the motor can follow',
-    ))
+    ))))
 
 
 def _fitted(

@@ -22,7 +22,14 @@ from backlash_ros.core.identification.deviations import (
     least_response,
     response_of,
 )
-from backlash_ros.core.identification.result import Details, HeldOut, Identification, Options
+from backlash_ros.core.identification.result import (
+    Details,
+    FoundModel,
+    HeldOut,
+    Identification,
+    Noise,
+    Options,
+)
 from backlash_ros.core.identification.structure import (
     TINY,
     VAGUE,
@@ -67,7 +74,7 @@ def identify(
     given, part = Identification(sample_period, v, y), busiest(v, y)
     nothing = _why_nothing(v, y[part], options)
     if nothing:
-        return replace(given, reasons=(nothing,))
+        return replace(given, refused=nothing)
     units = Units(float(v.mean()), float(np.ptp(v[part])), float(np.nanmedian(y)),
                   float(np.nanstd(y[part])))
     v, y = (v - units.v) / units.v_size, (y - units.y) / units.y_size
@@ -98,7 +105,6 @@ def identify(
             best = fitted(samples, best.structure, best.fit)
         best = least_response(best)
     progress('judging')
-    given = replace(given, outliers=int((np.isfinite(given.y) & np.isnan(samples.y)).sum()))
     s = s._replace(samples=samples, best=best, held_out=s.held_out._replace(
         first=part.start + s.held_out.first))
     return _as_a_gain(_described(s, given, options, units), s, given, options, units)
@@ -190,22 +196,23 @@ def _described(
     # As parameters have it: z where G is a gain, for B acts a sample late.
     at_zero = structure.numerator_taps - structure.order
     free = len(residual) - structure.unknowns
+    details = Details(
+        s.samples.first, units.v + units.v_size * best.problem.v, observed.y, observed.p,
+        observed.simulated, g,
+        tuple(one._replace(held_out=units.y_size * one.held_out) for one in s.compared), chosen,
+        (units.v_size * s.profile[0], units.y_size * s.profile[1]), held_out)
     return replace(
-        given, m=options.slope, gap=gap, c_r=c_r, c_l=c_r - gap,
+        given, m=options.slope, gap=gap, c_r=c_r,
         std={'m': options.slope * gain_std, 'gap': verdict.gap_std,
              'c_r': sqrt(max(c_r_var + more, 0.0)), 'c_l': sqrt(c_l_var + more)},
-        numerator=tuple((g.numerator / options.slope).tolist()),
-        denominator=(*best.denominator.tolist(), *[0.0] * at_zero),
-        delay=structure.delay, delays=delays, integrator=structure.integrator,
-        noise_std=units.y_size * sqrt(squares / max(free, 1)), quantum=step,
-        correlation=lag_one(residual, certain=True), frequencies=frequencies, response_std=spread,
-        uncertainty=_as_parameter(2.0 * float(spread.max())),
-        reasons=verdict.reasons, remarks=verdict.remarks, verdict=verdict,
-        details=Details(
-            s.samples.first, units.v + units.v_size * best.problem.v, observed.y, observed.p,
-            observed.simulated, g,
-            tuple(one._replace(held_out=units.y_size * one.held_out) for one in s.compared), chosen,
-            (units.v_size * s.profile[0], units.y_size * s.profile[1]), held_out),
+        model=FoundModel(
+            tuple((g.numerator / options.slope).tolist()),
+            (*best.denominator.tolist(), *[0.0] * at_zero), structure.delay, delays,
+            structure.integrator, frequencies, spread, _as_parameter(2.0 * float(spread.max()))),
+        noise=Noise(
+            units.y_size * sqrt(squares / max(free, 1)), step, lag_one(residual, certain=True),
+            int((np.isfinite(given.y) & np.isnan(s.samples.y)).sum())),
+        fit=(details, verdict),
     )
 
 
@@ -232,7 +239,8 @@ def _as_a_gain(
     if not known or apart * units.v_size >= CERTAIN * found.std['gap']:
         return found
     moved = sqrt(best.squares / float(np.var(best.problem.y[best.problem.known])) / len(best.left))
-    return replace(gain, uncertainty=max(gain.uncertainty, _as_parameter(2.0 * moved)))
+    uncertainty = max(gain.model.uncertainty, _as_parameter(2.0 * moved))
+    return replace(gain, model=gain.model._replace(uncertainty=uncertainty))
 
 
 def _still(best: Model) -> float:

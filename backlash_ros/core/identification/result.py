@@ -76,17 +76,41 @@ class Details(NamedTuple):
     held_out: HeldOut
 
 
+class FoundModel(NamedTuple):
+    """y = z^-delay numerator / denominator u, for the m that was told, and how surely it is known.
+
+    delays: that explain y equally well. response_std: relative deviation of G at `frequencies`
+    [rad/sample], between which y moves. uncertainty: of G, as the parameter plant.uncertainty.
+    """
+
+    numerator: tuple[float, ...] = ()
+    denominator: tuple[float, ...] = ()
+    delay: int = 0
+    delays: tuple[int, ...] = ()
+    integrator: bool = False
+    frequencies: Array = np.empty(0)
+    response_std: Array = np.empty(0)
+    uncertainty: float = nan
+
+
+class Noise(NamedTuple):
+    """Of y. std: deviation. quantum: step of a quantised y, 0 for none. correlation: of successive
+    residuals beyond chance. outliers: samples that were left out."""
+
+    std: float = nan
+    quantum: float = 0.0
+    correlation: float = nan
+    outliers: int = 0
+
+
 @dataclass(frozen=True)
 class Identification:
-    """What was found. u = m (p - c_r), y = z^-delay numerator / denominator u + noise.
+    """What was found. u = m (p - c_r), y = G u + noise.
 
-    std: deviations of gap, c_r, c_l and, for m, of the product of m and the gain of G. delays: that
-    explain y equally well. quantum: step of a quantised y, 0 for none. correlation: of successive
-    residuals beyond chance. response_std: relative deviation of G at `frequencies` [rad/sample],
-    between which y moves. uncertainty: of G, as the parameter plant.uncertainty. outliers: samples
-    of y that were left out. reasons: why it is of no use, remarks: what to know, a sentence each.
-    details, verdict: None where nothing was fitted. actuator: between the command and v; None
-    where nothing is, or it is not known.
+    m: as it was told. std: deviations of gap, c_r, c_l and, for m, of the product of m and the gain
+    of G. refused: why nothing was fitted, or why a controller does not take it. details, verdict:
+    None where nothing was fitted. actuator: between the command and v; None where nothing is, or it
+    is not known.
     """
 
     sample_period: float
@@ -95,25 +119,37 @@ class Identification:
     m: float = nan
     gap: float = nan
     c_r: float = nan
-    c_l: float = nan
     std: dict[str, float] = field(default_factory=dict)
-    numerator: tuple[float, ...] = ()
-    denominator: tuple[float, ...] = ()
-    delay: int = 0
-    delays: tuple[int, ...] = ()
-    integrator: bool = False
-    noise_std: float = nan
-    quantum: float = 0.0
-    correlation: float = nan
-    frequencies: Array = field(default_factory=lambda: np.empty(0))
-    response_std: Array = field(default_factory=lambda: np.empty(0))
-    uncertainty: float = nan
-    outliers: int = 0
-    reasons: tuple[str, ...] = ()
-    remarks: tuple[str, ...] = ()
-    details: Details | None = None
-    verdict: Verdict | None = None
+    model: FoundModel = field(default_factory=FoundModel)
+    noise: Noise = field(default_factory=Noise)
+    refused: str = ''
+    fit: tuple[Details, Verdict] | None = None
     actuator: Actuator | None = None
+
+    @property
+    def c_l(self) -> float:
+        """Left crossing."""
+        return self.c_r - self.gap
+
+    @property
+    def details(self) -> Details | None:
+        """What pictures show."""
+        return self.fit and self.fit[0]
+
+    @property
+    def verdict(self) -> Verdict | None:
+        """What is known."""
+        return self.fit and self.fit[1]
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why it is of no use to a controller, a sentence each."""
+        return (self.refused,) if self.refused else self.verdict.reasons if self.verdict else ()
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What to know, a sentence each."""
+        return self.verdict.remarks if self.verdict else ()
 
     @property
     def usable(self) -> bool:

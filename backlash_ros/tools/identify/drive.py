@@ -150,7 +150,7 @@ def _follow(
             else:
                 bar.write(line, file=sys.stderr)
             if found.usable and max(found.std['gap'], found.gap * float(
-                    found.response_std.max())) <= options.precision * found.gap:
+                    found.model.response_std.max())) <= options.precision * found.gap:
                 break
     # Without waiting for it: the node is to come to rest now.
     given_up.set()
@@ -162,7 +162,7 @@ def _said(found: Identification) -> str:
         return found.reasons[0]
     return (
         f'gap {found.gap:.4g} ± {found.std["gap"]:.1g}, c_r {found.c_r:.4g} ± '
-        f'{found.std["c_r"]:.1g}, G ± {found.response_std.max():.1%}'
+        f'{found.std["c_r"]:.1g}, G ± {found.model.response_std.max():.1%}'
     )
 
 

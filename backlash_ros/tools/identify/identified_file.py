@@ -50,10 +50,10 @@ def identified_parameters(
            if not {'waveform', 'amplitude', 'frequency', 'bias', 'file'} & set(given) else {}),
         **{name: value for name, value in given.items() if not name.startswith(not_taken_over)},
         'sample_period': found.sample_period,
-        'plant.numerator': found.numerator,
-        'plant.denominator': found.denominator,
-        'plant.uncertainty': found.uncertainty,
-        'control.delay_samples': found.delay,
+        'plant.numerator': found.model.numerator,
+        'plant.denominator': found.model.denominator,
+        'plant.uncertainty': found.model.uncertainty,
+        'control.delay_samples': found.model.delay,
         # None where v is the command: whatever the given file has of it is outdated.
         'actuator.numerator': tuple(lag.numerator.tolist()) if lag else (),
         'actuator.denominator': tuple(lag.denominator.tolist()) if lag else (),
@@ -62,11 +62,11 @@ def identified_parameters(
         'estimator.initial.c_r': c_r, 'estimator.initial.c_l': c_l,
         'estimator.bounds.m': (_short(found.m / wider), _short(found.m * wider)),
         'estimator.bounds.c_r': (-scale, scale), 'estimator.bounds.c_l': (-scale, scale),
-        'estimator.output_noise_std': _short(max(found.noise_std, 1e-12)),
+        'estimator.output_noise_std': _short(max(found.noise.std, 1e-12)),
         # The simulated plant is the one that was found, so that the file can be tried out.
         'backlash.m': found.m, 'backlash.c_r': c_r, 'backlash.c_l': c_l,
-        'output_quantum': _short(found.quantum, 6),
-        'output_noise_std': 0.0 if found.quantum else _short(found.noise_std),
+        'output_quantum': _short(found.noise.quantum, 6),
+        'output_noise_std': 0.0 if found.noise.quantum else _short(found.noise.std),
         **({'estimates.file': str(estimates), 'estimates.load': True} if estimates else {}),
     }
     if 'structure' not in given:
@@ -92,20 +92,20 @@ def _short(value: float, digits: int = 3) -> float:
 def _reference(found: Identification, details: Details) -> dict[str, Value]:
     """A reference that the actuator can follow, and that shows the gap."""
     y = found.y[np.isfinite(found.y)]
-    middle = 0.0 if found.integrator else 0.5 * float(np.percentile(y, 5) + np.percentile(y, 95))
-    gain = float(np.abs(details.response.at(found.frequencies[:1]))[0])
+    middle = 0.0 if found.model.integrator else 0.5 * float(np.percentile(y, [5, 95]).sum())
+    gain = float(np.abs(details.response.at(found.model.frequencies[:1]))[0])
     reach = 0.5 * (float(np.ptp(found.v)) - found.gap)
     share = max(0.4, min(0.75 * found.gap / reach, 0.8))
     return {
         'waveform': 'sine', 'amplitude': _short(share * gain * reach), 'bias': _short(middle),
-        'frequency': _short(found.frequencies[0] / found.sample_period),
+        'frequency': _short(found.model.frequencies[0] / found.sample_period),
     }
 
 
 def _weights(found: Identification, details: Details) -> dict[str, Value]:
     """The usual weight of u, at a frequency where G is known and v still moves y."""
     # To the frequency [rad/sample] at which tracking.input_weight takes |G|.
-    w = np.linspace(found.frequencies[0], np.pi / 10.0, 200)
+    w = np.linspace(found.model.frequencies[0], np.pi / 10.0, 200)
     gain = np.abs(details.response.at(w))
     if found.actuator is not None:
         gain = gain * np.abs(found.actuator.lag.response(np.exp(1j * w)))
@@ -139,19 +139,22 @@ def numbers(found: Identification) -> dict[str, Any]:
     """Content of identified.json."""
     held_out = found.details and found.details.held_out
     actuator = found.actuator
-    as_they_are = ('usable', 'reasons', 'remarks', 'm', 'gap', 'c_r', 'c_l', 'numerator',
-                   'denominator', 'integrator', 'sample_period', 'uncertainty', 'outliers')
+    of_all = ('usable', 'reasons', 'remarks', 'm', 'gap', 'c_r', 'c_l', 'sample_period')
+    of_model = ('numerator', 'denominator', 'integrator', 'uncertainty')
     return {
-        **{name: getattr(found, name) for name in as_they_are},
+        **{name: getattr(found, name) for name in of_all},
+        **{name: getattr(found.model, name) for name in of_model},
+        'outliers': found.noise.outliers,
         'known': None if found.verdict is None else {
             name: getattr(found.verdict, name)._asdict() for name in ('backlash', 'gain', 'model')
         },
         'offset': 0.5 * (found.c_r + found.c_l),
         'std': dict(found.std) or dict.fromkeys(('m', 'gap', 'c_r', 'c_l')),
-        'delay_samples': found.delay, 'equally_good_delays': found.delays,
-        'output_noise_std': found.noise_std, 'output_quantum': found.quantum,
+        'delay_samples': found.model.delay, 'equally_good_delays': found.model.delays,
+        'output_noise_std': found.noise.std, 'output_quantum': found.noise.quantum,
         'response': {
-            'frequency_hz': hertz(found).tolist(), 'relative_std': found.response_std.tolist(),
+            'frequency_hz': hertz(found).tolist(),
+            'relative_std': found.model.response_std.tolist(),
         },
         'held_out': held_out and {'rms': held_out.rms, 'rms_of_fit': held_out.trained},
         'actuator': actuator and {
@@ -164,7 +167,7 @@ def numbers(found: Identification) -> dict[str, Any]:
 
 def hertz(found: Identification) -> np.ndarray[Any, np.dtype[np.float64]]:
     """Frequencies at which the deviation of G is told [Hz]."""
-    return np.asarray(found.frequencies / (2.0 * np.pi * found.sample_period))
+    return np.asarray(found.model.frequencies / (2.0 * np.pi * found.sample_period))
 
 
 def commented_yaml(
@@ -173,9 +176,9 @@ def commented_yaml(
     """A parameter file that says of each value what it is and, where it was found, how surely."""
     band, std = hertz(found), found.std
     comments = {
-        'plant.numerator': f'G to ± {100.0 * found.response_std.max():.2g} % from {band[0]:.2g} to '
-                           f'{band[-1]:.2g} Hz; its gain is that for m = {found.m:g}, ± '
-                           f'{100.0 * std["m"] / found.m:.2g} %',
+        'plant.numerator': f'G to ± {100.0 * found.model.response_std.max():.2g} % from '
+                           f'{band[0]:.2g} to {band[-1]:.2g} Hz; its gain is that for m = '
+                           f'{found.m:g}, ± {100.0 * std["m"] / found.m:.2g} %',
         'estimator.initial.m': 'as told with --slope, 1 where it was not: G has the gain for it',
         'estimator.initial.c_r': f'± {std["c_r"]:.2g} [v]',
         'estimator.initial.c_l': f'± {std["c_l"]:.2g} [v]',

@@ -70,7 +70,7 @@ def write_outcome(
             write_atomically(out / YAML, text)
             save_estimate(estimates, as_estimate(found, parameters), parameters)
         except ParameterError as error:
-            found = replace(found, reasons=(f'the controller does not take it: {error}',))
+            found = replace(found, refused=f'the controller does not take it: {error}')
     write_summary({**numbers(found), 'timing': record.timing, 'notes': record.notes},
                   out / 'identified.json')
     write_record(record, out / 'record.csv')
@@ -114,19 +114,18 @@ def write_record(record: Record, path: Path) -> None:
 
 def _facts(found: Identification, record: Record) -> list[tuple[str, str]]:
     """What was found besides the backlash, by name, for the terminal and the page."""
-    told = [('time', record.timing), ('lost samples, outliers', f'{record.lost}, {found.outliers}')]
+    g, noise = found.model, found.noise
+    told = [('time', record.timing), ('lost samples, outliers', f'{record.lost}, {noise.outliers}')]
     if found.details is not None:
         band, held_out = hertz(found), found.details.held_out
-        alike = f' ({found.delays[0]} to {found.delays[-1]} fit alike)' \
-            if len(found.delays) > 1 else ''
+        alike = f' ({g.delays[0]} to {g.delays[-1]} fit alike)' if len(g.delays) > 1 else ''
         told += [
-            ('G(z)', f'{len(found.denominator) - 1} poles'
-                     f'{", one of them an integrator" * found.integrator}, delay {found.delay}'
-                     f'{alike}, known to {100.0 * found.response_std.max():.2g} % from '
-                     f'{band[0]:.2g} to {band[-1]:.2g} Hz'),
-            ('poles', ', '.join(f'{pole:.5g}' for pole in np.roots(found.denominator).tolist())),
-            ('noise of y', f'{found.noise_std:.3g}'
-                           + (f', steps of {found.quantum:.3g}' if found.quantum else '')),
+            ('G(z)', f'{len(g.denominator) - 1} poles{", one of them an integrator" * g.integrator}'
+                     f', delay {g.delay}{alike}, known to {100.0 * g.response_std.max():.2g} % '
+                     f'from {band[0]:.2g} to {band[-1]:.2g} Hz'),
+            ('poles', ', '.join(f'{pole:.5g}' for pole in np.roots(g.denominator).tolist())),
+            ('noise of y', f'{noise.std:.3g}'
+                           + (f', steps of {noise.quantum:.3g}' if noise.quantum else '')),
             ('error on samples held out', f'{held_out.rms:.3g} (fit: {held_out.trained:.3g})')]
     if (actuator := found.actuator) is not None:
         told.append(('L(z), from control to applied_control',

@@ -118,7 +118,7 @@ def _residual(figure: Figure, found: Identification, details: Details) -> None:
     residual, v = details.y - details.simulated, details.v
     t = found.sample_period * (details.first + np.arange(len(residual), dtype=float))
     curve(over_time, t, residual, HUES['e'], width=0.8)
-    label(over_time, f'Deviation {found.noise_std:.3g}', 'residual', TIME_LABEL)
+    label(over_time, f'Deviation {found.noise.std:.3g}', 'residual', TIME_LABEL)
     bound = BAND_STDS / np.sqrt(np.isfinite(residual).sum())
     r = autocorrelation(residual, 60)[1:]
     correlated.axhspan(-bound, bound, color='#bbbbbb', alpha=0.5, linewidth=0)
@@ -139,8 +139,8 @@ def _residual(figure: Figure, found: Identification, details: Details) -> None:
 
 def _bode(figure: Figure, found: Identification, details: Details) -> None:
     rooms = figure.subplots(2, 1, sharex=True)
-    w = np.geomspace(max(found.frequencies[0] / 5.0, 1e-5), 0.98 * np.pi, 400)
-    value = details.response.at(w) * np.exp(-1j * w * found.delay)
+    w = np.geomspace(max(found.model.frequencies[0] / 5.0, 1e-5), 0.98 * np.pi, 400)
+    value = details.response.at(w) * np.exp(-1j * w * found.model.delay)
     spread = BAND_STDS * details.response.std(w)
     f, size, phase = w / (2.0 * np.pi * found.sample_period), np.abs(value), np.degrees(
         np.unwrap(np.angle(value)))

@@ -80,7 +80,7 @@ def test_the_file_holds_it_and_forgets_one_that_is_not_there() -> None:
     assert parameters['actuator.wind_up'] == pytest.approx((0.05, 0.03), rel=0.02)
     assert parameters['estimator.use_applied_control'] == 'true'
     # Every digit: twelve would split a double integrator into a stable and an unstable pole.
-    assert parameters['plant.denominator'] == found_so.denominator
+    assert parameters['plant.denominator'] == found_so.model.denominator
     assert 'actuator' in commented_yaml(parameters, found_so, 'a test')
     again = identified_parameters(replace(found_so, actuator=None), {
         **given, 'actuator.numerator': (1.0,), 'actuator.denominator': (1.0, 0.0),

@@ -48,13 +48,13 @@ def test_random_actuators_are_found_to_within_their_deviations(seed: int) -> Non
     case = random_case(seed)
     found = identify(case.v, case.y, case.period)
     assert found.reasons == ()
-    assert found.integrator == case.integrating
-    assert case.delay in found.delays
+    assert found.model.integrator == case.integrating
+    assert case.delay in found.model.delays
     for name, true in (('gap', case.gap), ('c_r', case.c_r), ('c_l', case.c_l)):
         assert abs(getattr(found, name) - true) < max(4.0 * found.std[name], 1e-9)
     assert found.details is not None
-    w = found.frequencies
-    ratio = found.details.response.at(w) * np.exp(-1j * w * found.delay) / case.response(w)
+    w = found.model.frequencies
+    ratio = found.details.response.at(w) * np.exp(-1j * w * found.model.delay) / case.response(w)
     assert np.abs(ratio - 1.0).max() < 0.03
 
 
@@ -63,16 +63,16 @@ def test_rounding_alone_is_no_reason_for_a_further_pole(monkeypatch, seed):
     monkeypatch.setattr(identification_cases, 'NOISE', (1e-300, 1e-300))
     case = random_case(seed)
     found = identify(case.v, case.y, case.period)
-    assert len(found.denominator) == len(case.denominator)
-    assert found.denominator == pytest.approx(case.denominator, abs=1e-9)
+    assert len(found.model.denominator) == len(case.denominator)
+    assert found.model.denominator == pytest.approx(case.denominator, abs=1e-9)
 
 
 def test_delays_that_contradict_each_other_where_each_is_sure_leave_the_gentler_one() -> None:
     # By its deviations alone, each of these delays tells all of G.
     case = random_case(1042)
     found = identify(case.v, case.y, case.period, Options((1, 2)))
-    assert len(found.delays) > 2
-    assert found.delay == case.delay
+    assert len(found.model.delays) > 2
+    assert found.model.delay == case.delay
 
 
 def test_lost_samples_and_outliers_do_not_matter() -> None:
@@ -82,10 +82,10 @@ def test_lost_samples_and_outliers_do_not_matter() -> None:
     wild = rng.choice(np.flatnonzero(np.isfinite(y)), 12, replace=False)
     y[wild] += 5.0
     found = identify(v, y, PERIOD_S, QUICK)
-    assert 12 <= found.outliers <= 40
+    assert 12 <= found.noise.outliers <= 40
     assert found.gap == pytest.approx(0.9, abs=4.0 * found.std['gap'])
-    assert found.delay == 1
-    assert found.denominator == pytest.approx((1.0, -1.7, 0.755), abs=0.01)
+    assert found.model.delay == 1
+    assert found.model.denominator == pytest.approx((1.0, -1.7, 0.755), abs=0.01)
 
 
 def test_readings_that_come_twice_make_no_gap_wider() -> None:
@@ -94,7 +94,7 @@ def test_readings_that_come_twice_make_no_gap_wider() -> None:
     for k in again:
         y[k] = y[k - 1]
     found = identify(v, y, PERIOD_S, QUICK)
-    assert found.outliers > 0.6 * len(again)
+    assert found.noise.outliers > 0.6 * len(again)
     assert abs(found.gap - 0.9) < 2.5 * found.std['gap'] < 0.01
 
 
@@ -125,7 +125,7 @@ def test_an_offset_of_y_takes_no_digits_from_it() -> None:
     v, y = record(800)
     near, far = identify(v, y, PERIOD_S, QUICK), identify(v, y + 8e8, PERIOD_S, QUICK)
     assert far.gap == pytest.approx(near.gap, rel=1e-4)
-    assert far.denominator == pytest.approx(near.denominator, abs=1e-3)
+    assert far.model.denominator == pytest.approx(near.model.denominator, abs=1e-3)
     assert far.c_r < -1e8
 
 

@@ -77,8 +77,8 @@ def test_a_gain_and_a_delay_have_no_poles_and_can_be_controlled() -> None:
     y = np.append(np.zeros(3), 1.7 * u[:-3]) + 0.002 * rng.standard_normal(len(v))
     found = identify(v, y, 0.02, Options((0, 1), (1, 2, 3)))
     assert found.usable
-    assert (found.delay, found.denominator) == (2, (1.0, 0.0))
-    assert found.numerator == pytest.approx((1.7,), abs=0.01)
+    assert (found.model.delay, found.model.denominator) == (2, (1.0, 0.0))
+    assert found.model.numerator == pytest.approx((1.7,), abs=0.01)
     assert found.gap == pytest.approx(0.4, abs=3.0 * found.std['gap'])
     # A delay that may be longer than all that were compared is no narrow gap.
     edge = identify(v, y, 0.02, Options((0, 1), (0, 1)))
@@ -92,6 +92,6 @@ def test_a_delay_beyond_those_that_are_compared_first_is_found() -> None:
     u = play(v, 0.4, 0.2) - 0.1
     y = lfilter([0.0, 0.3], [1.0, -0.7], np.append(np.zeros(12), u[:-12]))
     found = identify(v, y + 0.002 * rng.standard_normal(len(v)), 0.02, Options((1, 2)))
-    assert found.delay == 12
+    assert found.model.delay == 12
     assert found.gap == pytest.approx(0.4, abs=4.0 * found.std['gap'])
     assert found.std['gap'] < 0.01
