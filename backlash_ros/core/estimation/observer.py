@@ -92,29 +92,29 @@ class Observer:
         self, model: StateModel, noise_std: float, before: Observer | None = None,
         gains: tuple[Gain, ...] | None = None,
     ) -> None:
-        self.noise_std = noise_std
-        self._gains = gains or gains_of(model.transfer_function)
+        self._model, self._gains, self._level = model, gains, -1
         highest = len(RATIOS) if before is None else before._level
-        self._level: int = min(len(RATIOS) // 2, highest)
+        self._use(min(len(RATIOS) // 2, highest), noise_std)
         self.variance = (self._gain.innovation * noise_std) ** 2  # of the innovation, measured
         self._advance = model.transfer_function.advance
         self._x = [0.0] * model.order
         self._to_state = tuple(map(tuple, model.to_state.tolist()))
 
-    @property
-    def _gain(self) -> Gain:
-        return self._gains[self._level]
+    def _use(self, level: int, noise_std: float) -> None:
+        """Use the gain for this noise on u, and on y."""
+        if level != self._level:
+            # All gains take milliseconds: where no fit brought them, only the one that is needed.
+            self._gain = gain_of(self._model, RATIOS[level]) if self._gains is None \
+                else self._gains[level]
+        self._level, self.noise_std = level, noise_std
+        # Of the state while the innovations are what they are, (n, n): the same array until then.
+        self.cov = self._gain.cov * noise_std**2
 
     @property
     def state(self) -> list[float]:
         """x in the coordinates of StateModel, n values."""
         x = self._x
         return [sum(map(mul, row, x)) for row in self._to_state]
-
-    @property
-    def cov(self) -> Array:
-        """Covariance of the state while the innovations are what they are, shape (n, n)."""
-        return self._gain.cov * self.noise_std**2
 
     def place(self, x: Array, known: bool) -> None:
         """Go on from the state x in the observer form.
@@ -123,7 +123,8 @@ class Observer:
         it little.
         """
         self._x = x.tolist()
-        self._level = 0 if known else self._level
+        if known:
+            self._use(0, self.noise_std)
 
     def predict(self, u: float) -> float:
         """Take u over one period and return the y that is expected after it."""
@@ -138,12 +139,13 @@ class Observer:
 
     def settle(self, noise_std: float) -> None:
         """Go a step towards the smallest gain that explains the innovations, with this noise."""
-        self.noise_std, gain = noise_std, self._gain
+        gain, level = self._gain, self._level
         # What chance explains: 15 % of the deviation.
         if self.variance > (1.15 * gain.innovation * noise_std) ** 2:
-            self._level = min(self._level + 1, len(RATIOS) - 1)
+            level = min(level + 1, len(RATIOS) - 1)
         elif self.variance < gain.innovation * gain.quiet * noise_std**2:
-            self._level = max(self._level - 1, 0)
+            level = max(level - 1, 0)
+        self._use(level, noise_std)
 
 
 class Place(NamedTuple):
@@ -200,7 +202,9 @@ class Following:
         self.u = self.innovation = nan
         self.since_motion = self.outliers = self.beyond = 0
         self._p = nan  # v until a backlash is known
-        self._newest: deque[tuple[float, float]] = deque(maxlen=ROWS)  # u and y
+        # Over the newest samples. Numbers: the collector would have to visit so many pairs.
+        self._u: deque[float] = deque(maxlen=ROWS)
+        self._y: deque[float] = deque(maxlen=ROWS)
 
     @property
     def surprised(self) -> bool:
@@ -223,9 +227,10 @@ class Following:
             self.before = self.before.with_model(model)
         if self.observer is not None:
             self.observer = Observer(model, self.observer.noise_std, self.observer, gains)
-            u, y = np.array(self._newest).reshape(-1, 2).T
+            y = np.array(self._y)
             if np.isfinite(y).sum() > model.order:
-                self.observer.place(state_after(model.transfer_function, u, y), True)
+                x = state_after(model.transfer_function, np.array(self._u), y)
+                self.observer.place(x, True)
 
     def step(self, y: float | None, interval: Interval, estimate: Estimate) -> None:
         """Take in y(k), None if it was lost, and v of the interval before it."""
@@ -238,7 +243,8 @@ class Following:
                 self.before.update(y, interval)
             return
         self.u = u = estimate.m * (p - estimate.c_r)
-        self._newest.append((u, nan if y is None else y))
+        self._u.append(u)
+        self._y.append(nan if y is None else y)
         expected = observer.predict(u)
         if y is None:
             self.innovation = nan
@@ -268,14 +274,15 @@ class Following:
         else:
             self.observer.settle(noise_std)
         observer, gap = self.observer, estimate.c_r - estimate.c_l
-        self._newest = deque(np.column_stack([place.u, place.y]).tolist(), ROWS)
+        self._u, self._y = deque(place.u.tolist(), ROWS), deque(place.y.tolist(), ROWS)
         self._p, self.u = place.p, estimate.m * (place.p - estimate.c_r)
         if follows:
             observer.place(place.x, known)
         for v, y in newer.T.tolist():
             self._p = clamp(self._p, v, v + gap)
             self.u = estimate.m * (self._p - estimate.c_r)
-            self._newest.append((self.u, y))
+            self._u.append(self.u)
+            self._y.append(y)
             if follows:
                 innovation = y - observer.predict(self.u)
                 if innovation * innovation <= GATE**2 * observer.variance:  # not where y was lost
