@@ -15,6 +15,7 @@ so that the zeros are those of the altered G(s), sampled.
 
 from __future__ import annotations
 
+import warnings
 from math import sqrt
 
 import numpy as np
@@ -123,7 +124,9 @@ def altered_plant(
     n = len(poles)
     sampled = _block(*inner.state_space()[:2])
     sampled[n, n] = 1.0
-    block = np.real(logm(sampled))
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore', RuntimeWarning)  # SciPy tells of an error of 1e-13
+        block = np.real(logm(sampled))
     numerator = _numerator(block[:n, :n], block[:n, n], np.real(np.poly(poles)))
     poles = _damped(poles, damping) * frequency
     numerator *= frequency**(np.arange(1, n + 1) - np.count_nonzero(poles == 0.0))
