@@ -145,8 +145,9 @@ class ReferenceWindow:
         # Mean square of what is left beside a parabola, in those of the noise, up to which the
         # references are taken for one, and from which on not: at a step, or a sharp turn.
         one, none = 1.8, 3.0
-        fits, first, degrees, middle = parabolas(self._preview)
-        half, came, noise = fits.shape[1] // 2, self._rows[0], self._noise.std
+        beside = parabolas(self._preview)
+        fits, first, degrees, middle = beside
+        half, came, noise = beside.half, self._rows[0], self._noise.std
         rest = fits @ came[at - half:at + half + 1]
         of_noise = rest / noise  # its square may be too small for a number
         squares = np.add.reduceat(of_noise * of_noise, first).tolist()

@@ -87,8 +87,8 @@ class IdealTrajectory:
 
         Returns whether it does.
         """
-        of_noise = [plan.noise_gains.item(-1) for plan in self._design.plans]
-        noise_std, now = self.references.noise_std, of_noise[self.softness]
+        of_noise, noise_std = self._design.plan_noise, self.references.noise_std
+        now = of_noise[self.softness]
         if gap_u == 0.0 or noise_std * now <= QUIET * gap_u:
             return False
         softer = next((i for i, gain in enumerate(of_noise) if noise_std * gain <= QUIET * gap_u),
