@@ -26,7 +26,6 @@ from numpy.polynomial.polynomial import polyval
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.fit import Problem
-from backlash_ros.core.estimation.plant_family import state_columns
 from backlash_ros.core.estimation.posterior import WindowFit
 from backlash_ros.core.identification.structure import VAGUE, Model
 
@@ -188,15 +187,10 @@ def _smoothed(found: Model, silent: Array, noise_variance: float) -> Model:
     pull = covariance @ rows.T @ rows
     for weight in 1e6 / max(float(np.trace(pull)), 1e-300) * 0.0625 ** np.arange(12.0):
         theta = np.linalg.solve(np.eye(len(pull)) + weight * pull, found.fit.theta)
-        fit = replace(found.fit, theta=theta, x=np.zeros(1))
-        a = found.structure.at(fit.xi)[1]
-        if not np.isfinite(a).all():
+        fit = replace(found.fit, theta=theta)
+        if not np.isfinite(found.structure.at(fit.xi)[1]).all():
             continue  # a pole has left the unit circle
-        # The state before the record is the best for it.
-        left, known = found.problem.residual(fit), found.problem.known
-        columns = state_columns(a, len(left))[known]
-        state = np.linalg.lstsq(columns, left[known], rcond=1e-12)[0]
-        smooth = Model(found.structure, found.problem, replace(fit, x=state))
+        smooth = Model(found.structure, found.problem, found.problem.begun(fit))
         if smooth.squares <= found.squares + 4.0 * noise_variance:
             return smooth
     return found
