@@ -1,14 +1,16 @@
-"""What the default law makes of data that do not fit."""
+"""What the default law makes of data and of plants that do not fit."""
 
 from collections.abc import Callable
 
 import numpy as np
 import pytest
+from places import ROOT
 
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.run_record import RunRecord
+from backlash_ros.tools.config import read_configuration
 
 NOISE = 1e-3
 NAMES = ('m', 'c_r', 'c_l')
@@ -108,3 +110,30 @@ def test_plant_without_a_gap_is_recognised() -> None:
     assert record.column('status')[-1] == Status.TRACKING
     assert record.column('m')[-1] == pytest.approx(1.3, rel=0.01)
     assert record.column('c_r')[-1] - record.column('c_l')[-1] < 0.05
+
+
+SHIPPED = ROOT / 'config'
+
+
+@pytest.mark.parametrize('amplitude', [0.8, 1.2])
+def test_a_triangle_read_by_an_encoder_is_learned_from(amplitude: float) -> None:
+    # One speed tells a lag from a gap at the turns alone. At the amplitude of the file, 1, y moves
+    # by 26.08 steps of the encoder per sample: rounding that repeats is too coloured to learn from.
+    p = read_configuration(SHIPPED / 'geared_motor.yaml').given()
+    changed = Parameters({**p, 'waveform': 'triangle', 'amplitude': amplitude})
+    record = build_closed_loop(changed).run(1600)
+    later = slice(1000, None)
+    assert np.mean(record.column('status')[later] == Status.TRACKING) > 0.8
+    for name in ('m', 'c_r', 'c_l'):
+        true = record.column(f'true_{name}')[later]
+        assert np.abs(record.column(name)[later] / true - 1.0).max() < 0.01
+
+
+def test_where_the_play_began_does_not_contradict_readings_that_were_rounded() -> None:
+    # Labels before the first engagement are the least sure ones, and intervals the sharpest data.
+    p = Parameters({
+        **read_configuration(SHIPPED / 'geared_motor.yaml').given(), 'structure': 'proportional',
+        'truth.scale_frequency': 0.8,
+    })
+    record = build_closed_loop(p).run(900)
+    assert (record.column('status')[200:] == Status.TRACKING).all()

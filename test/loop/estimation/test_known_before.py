@@ -1,16 +1,42 @@
-"""What was learned before the run: what confirms it, what replaces it, and what leaves it alone."""
+"""What was known before the run: what confirms, replaces, contradicts it, and what leaves it."""
 
 from dataclasses import replace
 from itertools import accumulate, islice
+from math import pi, sin
 
 import numpy as np
 import pytest
-from known_gear import KNOWN, answers, estimator_knowing, learn
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
-from backlash_ros.core.estimate import Status
-from backlash_ros.core.law import Law
+from backlash_ros.core.assembly import build_controller
+from backlash_ros.core.estimate import Estimate, Status
+from backlash_ros.core.law import Interval, Law
+from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.backlash import clamp
+
+# Second order, 20 Hz, at 200 Hz, as in geared_motor.yaml.
+NUMERATOR, DENOMINATOR = (0.15678154, 0.12688103), (1.0, -1.24982552, 0.53348809)
+PARAMETERS = Parameters({
+    'sample_period': 0.005, 'plant.numerator': NUMERATOR, 'plant.denominator': DENOMINATOR,
+    'plant.uncertainty': 0.05, 'estimator.output_noise_std': 1e-4,
+    'estimator.initial.m': 1.0, 'estimator.initial.c_r': 0.5, 'estimator.initial.c_l': -0.5,
+})
+KNOWN = Estimate(1.0, 0.5, -0.5, 0.0, 1e-3, 2e-3, 2e-3)
+
+
+def estimator_knowing(known: Estimate) -> Law:
+    return build_controller(PARAMETERS, known).estimator
+
+
+def answers(u: list[float], late: int = 0) -> NDArray[np.float64]:
+    return np.asarray(lfilter([0.0] * late + list(NUMERATOR), DENOMINATOR, u))
+
+
+def learn(estimator: Law, v: float, y: float) -> None:
+    estimator.update(y, Interval(v, v, v, 0.0))
+    estimator.refine()
+
 
 Array = NDArray[np.float64]
 
@@ -67,3 +93,42 @@ def test_samples_that_say_little_leave_it_as_it_is() -> None:
     assert std.max() <= 1.01 * std[0]
     assert estimator.report.unconfirmed
     assert not np.any(status == Status.TRACKING)
+
+
+AMPLITUDE, FREQUENCY = 3.0, 2.0 * pi / 200.0  # of v, in gaps, and per sample
+ACCELERATION = AMPLITUDE * FREQUENCY**2
+
+
+def moved_by_a_sine(deceleration: float, late: int = 0, samples: int = 300) -> Law:
+    """Move v as a sine. deceleration: of a load in the gap, by friction. late: samples of delay."""
+    v = [AMPLITUDE * sin(FREQUENCY * k) for k in range(samples)]
+    u, p, speed = [], 0.5, 0.0
+    for wall in v:
+        on = max(abs(speed) - deceleration, 0.0)
+        moved = clamp(p + (on if speed > 0.0 else -on), wall, wall + 1.0)
+        p, speed = moved, moved - p
+        u.append(p - 0.5)
+    estimator = estimator_knowing(KNOWN)
+    for applied, y in zip(v, answers(u, late).tolist(), strict=True):
+        learn(estimator, applied, y)
+    return estimator
+
+
+def test_a_load_that_coasts_is_named_and_its_crossings_are_in_doubt() -> None:
+    estimator = moved_by_a_sine(0.5 * ACCELERATION)
+    assert estimator.estimate.status is Status.INCONSISTENT
+    assert estimator.report.coasts
+    assert estimator.estimate.c_r == pytest.approx(0.5, abs=0.01)
+    assert estimator.estimate.std_c_r > 0.1
+
+
+def test_friction_that_stops_the_load_is_backlash() -> None:
+    estimator = moved_by_a_sine(2.0 * ACCELERATION)
+    assert not estimator.report.coasts
+    assert estimator.estimate.status is not Status.INCONSISTENT
+    assert estimator.estimate.std_c_r < 0.01
+
+
+def test_a_lag_that_nobody_told_of_is_no_load_that_coasts() -> None:
+    estimator = moved_by_a_sine(2.0 * ACCELERATION, late=8)
+    assert not estimator.report.coasts

@@ -1,8 +1,8 @@
-"""Files of a run: complete, exact, and strict JSON."""
+"""Files and figures of a run: complete, exact, strict JSON; merits that are known."""
 
 import json
 from dataclasses import replace
-from math import nan
+from math import exp, nan
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,7 @@ from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core.loop.learned_model import LearnedModel
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
+from backlash_ros.core.simulation.metrics import control_error_rms, settling_time
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 from backlash_ros.tools.cli import InputError
 from backlash_ros.tools.runs import files as results
@@ -139,3 +140,36 @@ def test_broken_record_is_named(tmp_path: Path, content: bytes) -> None:
     path.write_bytes(content)
     with pytest.raises(InputError, match=r'record\.npz: is not a record'):
         results.read_record(path)
+
+
+T = np.arange(1000) * 0.01
+ONES = np.ones(1000)
+
+
+def record(samples: int = 1000, **signals: object) -> RunRecord:
+    rows = np.full((samples, len(COLUMNS)), nan)
+    rows[:, COLUMNS.index('t')] = T[:samples]
+    for name, values in signals.items():
+        rows[:, COLUMNS.index(name)] = values
+    return RunRecord(rows, 0.01)
+
+
+def test_settling_time_of_an_exponential_is_when_it_reaches_one_percent() -> None:
+    estimate = 3.0 * (1.0 + np.exp(-T))
+    assert exp(-4.61) < 0.01 < exp(-4.60)
+    assert settling_time(T, estimate, 3.0 * ONES) == pytest.approx(4.61)
+    assert settling_time(T, -estimate, -3.0 * ONES) == pytest.approx(4.61)
+
+
+def test_run_without_samples_has_no_figures() -> None:
+    nothing = record(samples=0)
+    assert nothing.samples == 0
+    assert not nothing.has_truth
+    assert control_error_rms(nothing) is None
+    assert settling_time(T[:0], ONES[:0], ONES[:0]) is None
+
+
+def test_truth_is_known_only_if_it_is_known_throughout() -> None:
+    assert record(true_m=1.3).has_truth
+    assert not record().has_truth
+    assert not record(true_m=np.where(T < 1.0, nan, 1.3)).has_truth

@@ -1,4 +1,4 @@
-"""Filter, Riccati and Lyapunov equations beside those of SciPy, which no controller loads."""
+"""G(z) against SciPy, which one is refused or warned of, and the equations solved for it."""
 
 from __future__ import annotations
 
@@ -7,11 +7,78 @@ import sys
 
 import numpy as np
 import pytest
-from scipy import linalg
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import linalg, signal
 from scipy.signal import lfilter as scipy_lfilter
+from strategies import output_of, plants
 
+from backlash_ros.core.assembly import build_controller, takes_model_as_exact, warnings_of
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.numerics import lfilter, lyapunov, riccati
 from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
+
+
+@given(model=plants(), seed=st.integers(0, 1000))
+def test_state_space_and_simulation_agree_with_scipy(model: TransferFunction, seed: int) -> None:
+    u = np.random.default_rng(seed).uniform(-1.0, 1.0, 60)
+    _, expected = signal.dlsim((np.trim_zeros(model.numerator, 'f'), model.denominator, 1.0), u)
+    a, b, c = model.state_space()
+    x, by_states = np.zeros(model.order), []
+    for value in u:
+        by_states.append(c @ x)
+        x = a @ x + b * value
+    size = np.abs(expected).max() + 1.0
+    np.testing.assert_allclose(by_states, expected[:, 0], atol=1e-8 * size)
+    np.testing.assert_allclose(output_of(model, u), expected[:, 0], atol=1e-8 * size)
+
+
+@given(model=plants())
+def test_frequency_response_agrees_with_scipy(model: TransferFunction) -> None:
+    w, expected = signal.freqz(model.numerator, model.denominator, np.linspace(0.1, 3.1, 30))
+    np.testing.assert_allclose(model.response(np.exp(1j * w)), expected, rtol=1e-6, atol=1e-12)
+
+
+def plant(numerator: list[float], denominator: list[float], **more: object) -> Parameters:
+    return Parameters({'plant.numerator': numerator, 'plant.denominator': denominator, **more})
+
+
+@pytest.mark.parametrize(('numerator', 'denominator', 'reason'), [
+    ([1.0], [1.0, -1.2], 'unstable pole 1.2'),
+    ([1.0, -1.0], [1.0, -0.5, 0.06], 'zero at z = 1'),
+    ([1.0, -1.0], [1.0, -1.5, 0.5], 'cancels the pole 1'),
+])
+def test_plant_through_which_nothing_can_be_learned_is_refused(numerator, denominator, reason):
+    with pytest.raises(ParameterError, match=reason):
+        build_controller(plant(numerator, denominator))
+
+
+@pytest.mark.parametrize(('parameters', 'reason'), [
+    (plant([1.0], [1.0, -0.99999]), 'slower than'),
+    (plant([1.0], [1.0, -2.0, 1.0]), 'integrates more than once'),
+    (plant([1.0, 1.0], [1.0, -0.5, 0.06]), 'on the unit circle'),
+    (Parameters({'frequency': 300.0}), 'samples per period'),
+])
+def test_plant_that_makes_it_hard_is_warned_of(parameters: Parameters, reason: str) -> None:
+    assert any(reason in warning for warning in warnings_of(parameters))
+
+
+def test_the_example_is_neither_refused_nor_warned_of() -> None:
+    build_controller(Parameters())
+    assert warnings_of(Parameters()) == []
+
+
+@pytest.mark.parametrize(('changes', 'exact'), [
+    ({'plant.uncertainty': 0.0}, False),  # the paper assumes it of its example
+    ({'plant.uncertainty': 0.0, 'plant.numerator': [2e-5, 4e-5, 1e-5]}, True),
+    ({'plant.numerator': [2e-5, 4e-5, 1e-5]}, False),
+    ({'plant.uncertainty': 0.0, 'plant.numerator': [2e-5, 4e-5, 1e-5],
+      'estimator.law': 'fixed'}, False),
+])
+def test_a_model_that_is_taken_as_exact_is_known(changes, exact):
+    assert takes_model_as_exact(Parameters(changes)) is exact
+
 
 LEARNS = """
 import sys

@@ -1,9 +1,13 @@
-"""The executor of the nodes: messages at once, and nothing else forgotten over them."""
+"""What serves others: the page of live, and the executor of the nodes."""
 
+import json
+import socket
+import threading
 from collections.abc import Callable, Iterator
 
 import pytest
 import rclpy
+from live_pages import frames
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.context import Context
@@ -12,8 +16,41 @@ from ros_processes import wait_until
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
+from backlash_ros.nodes.live import HOST, PageServer
 from backlash_ros.nodes.runtime.executor import PromptExecutor
 from backlash_ros.tools.bringup.environment import free_domain
+
+
+@pytest.fixture
+def served() -> Iterator[PageServer]:
+    server = PageServer(0, kept=3)
+    threading.Thread(target=server.serve_forever, kwargs={'poll_interval': 0.01}).start()
+    yield server
+    server.shutdown()
+    server.server_close()
+
+
+def test_a_reader_that_takes_nothing_holds_up_nobody(served):
+    # More than the kernel takes on the way.
+    served.add({'x': 'x' * 20_000_000}, {})
+    with socket.create_connection(served.server_address[:2]) as slow:
+        slow.sendall(f'GET /frame HTTP/1.1\r\nHost: {HOST}\r\n\r\n'.encode())
+        slow.recv(1, socket.MSG_PEEK)
+        for number in range(20):
+            served.add({'number': number}, {})
+            assert next(frames(served.address))['state'] == {'number': number}
+
+
+def test_a_reader_gets_the_newest_portions_and_each_of_them_once(served):
+    for k in range(5):
+        served.add({}, {'c': {'m': [float(k)]}})
+    seen = frames(served.address)
+    assert [portion['c']['m'] for portion in next(seen)['portions']] == [[2.0], [3.0], [4.0]]
+    served.add({}, {'c': {'m': [5.0]}})
+    assert [portion['c']['m'] for portion in next(seen)['portions']] == [[5.0]]
+    assert next(seen)['portions'] == []
+    # Who has seen more than there ever was has seen another server.
+    assert len(json.loads(served.frame(99))['portions']) == 3
 
 
 class Loop:

@@ -1,0 +1,132 @@
+"""Parts of the fit on their own: the family of G(z; xi), readings, the search, the observer."""
+
+import numpy as np
+import pytest
+from records import resonance
+from scipy.optimize import least_squares
+from scipy.signal import cont2discrete
+from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR
+
+from backlash_ros.core.estimation.observer import RATIOS, gain_of
+from backlash_ros.core.estimation.plant_family import PlantFamily
+from backlash_ros.core.estimation.posterior import independence, likelihood, mean_information
+from backlash_ros.core.estimation.search import search
+from backlash_ros.core.plant.backlash import play
+from backlash_ros.core.plant.numerics import lfilter
+from backlash_ros.core.plant.simulated_plant import altered_plant
+from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
+
+PLANTS = {
+    'one pole': ([0.3], [1.0, -0.7]), 'integrator': ([0.1], [1.0, -1.7, 0.7]),
+    'three poles': ([0.2, 0.1, 0.02], [1.0, -1.2, 0.4, -0.03]),
+    'delayed, real poles': ([0.1, 0.05], [1.0, -1.3, 0.4, 0.0]),
+}
+
+
+def two_poles(omega_t: float) -> TransferFunction:
+    b, a, _ = cont2discrete(([omega_t**2], [1.0, omega_t, omega_t**2]), 1.0)
+    return TransferFunction(b[0, 1:].tolist(), a.tolist())
+
+
+@pytest.mark.parametrize('plant', PLANTS.values(), ids=PLANTS)
+def test_slopes_are_those_of_the_coefficients(plant: tuple[list[float], list[float]]) -> None:
+    family, step = PlantFamily(TransferFunction(*plant), 0.2), 1e-6
+    xi = np.linspace(0.3, -0.4, family.count)
+    for slopes in zip(*family.slopes(xi.tolist()), strict=True):
+        assert all(np.isfinite(part).all() for part in slopes)
+    for j, (db, da) in enumerate(zip(*family.slopes(xi.tolist()), strict=True)):
+        ahead, behind = (family.at((xi + sign * step * np.eye(len(xi))[j]).tolist())
+                         for sign in (1.0, -1.0))
+        for slope, above, below in zip((db, da), ahead, behind, strict=True):
+            found = (np.array(above) - below) / (2.0 * step)
+            np.testing.assert_allclose(slope[:len(found)], found, atol=1e-8)
+
+
+@pytest.mark.parametrize('omega_t', [0.13, 1.0, 2.5])
+@pytest.mark.parametrize('lag', [0.0, 0.3, 1.0, 2.6])
+def test_dead_time_and_another_frequency_are_among_them(omega_t: float, lag: float) -> None:
+    family = PlantFamily(two_poles(omega_t), 0.2)
+    true = altered_plant(two_poles(omega_t), 0.9, 1.0, lag)
+    z = np.exp(1j * np.linspace(0.05, 3.0, 60))
+
+    def apart(xi: np.ndarray) -> np.ndarray:
+        off = family.model_at(xi.tolist()).response(z) - true.response(z)
+        return np.concatenate([off.real, off.imag])
+
+    begins = [[(lag + by) / family._scales[0][0], 0.0, 0.0, 0.0] for by in (-0.2, 0.1, 0.2)]
+    assert min(abs(least_squares(apart, begin).fun).max() for begin in begins) < 1e-6
+
+
+APART = 1e-3
+R = APART * np.arange(-12_000, 12_001)
+
+
+@pytest.mark.parametrize(('noise', 'step'), [(0.3, 0.0), (0.3, 1.0), (1.0, 1.0)])
+def test_density_slope_and_information_belong_together(noise: float, step: float) -> None:
+    found = likelihood(R, noise, step)
+    density = np.exp(found.log_density)
+    assert density.sum() * APART == pytest.approx(1.0, rel=1e-6)
+    near = np.abs(R) < 4.0 * noise
+    by_output = -np.gradient(found.log_density, R)
+    assert found.score[near] == pytest.approx(by_output[near], abs=1e-3)
+    expected = mean_information(step / noise) / step**2 if step else noise**-2
+    assert (found.score**2 * density).sum() * APART == pytest.approx(expected, rel=1e-3)
+
+
+def test_readings_that_repeat_one_rounding_count_as_one() -> None:
+    y, known = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 9.0]), np.arange(6) < 5
+    weights, begins = independence(y, known, np.full(6, 1.2), 1.0)
+    assert weights == pytest.approx([1 / 3] * 3 + [0.5] * 2 + [0.0])
+    assert begins.tolist() == [0, 3]
+    assert independence(y, known, 0.1 * np.arange(6), 1.0)[0].tolist() == known.tolist()
+
+
+def test_a_beginning_between_those_compared_changes_nothing() -> None:
+    # It lasts while v stays within the gap; after an integrator, what it is off by is a drift.
+    family = PlantFamily(TransferFunction([0.0, 0.1], [1.0, -1.0]), 0.0)
+    k, gap = np.arange(80), 2.3
+    v = np.where(k < 40, 0.2, 4.0) * np.sin(0.3 * k)
+    b, a = family.at([])
+    noise = 1e-3 * np.random.default_rng(1).standard_normal(len(k))
+    found = []
+    for share in (0.07, 0.18, 0.41, 0.6):
+        y = lfilter(b, a, play(v, gap, v[0] + share * gap)) + noise
+        found.append(search(family, v, y, 1e-3, 50.0, np.zeros(0))[0][0])
+    assert len({round(one.gap, 6) for one in found}) == 1
+
+
+MODELS = {
+    'resonance': StateModel(resonance()),
+    'integrating': StateModel(TransferFunction(PAPER_NUMERATOR, PAPER_DENOMINATOR)),
+    'delayed': StateModel(TransferFunction([0.2, 0.1], [1.0, -0.7, 0.0, 0.0])),
+}
+
+
+def stationary(model: StateModel, ratio: float) -> tuple[np.ndarray, float, np.ndarray]:
+    """Gain, variance of the innovation and covariance of x, by iterating the Kalman filter.
+
+    In units of the variance of y.
+    """
+    power = abs(model.transfer_function.response(np.exp([0.1j * np.pi]))[0])
+    noise = np.outer(model.b, model.b) * (ratio / power) ** 2
+    noise += 1e-9 * np.trace(noise) * np.eye(model.order)
+    c = np.zeros(model.order)
+    c[0] = model.c
+    p = np.eye(model.order)
+    for _ in range(20_000):
+        variance = c @ p @ c + 1.0
+        gain = p @ c / variance
+        kept = p - np.outer(gain, gain) * variance
+        p = model.a @ kept @ model.a.T + noise
+    return gain, float(variance), kept
+
+
+@pytest.mark.parametrize('ratio', [RATIOS[3], RATIOS[4], RATIOS[6]])
+@pytest.mark.parametrize('name', sorted(MODELS))
+def test_gain_is_that_of_the_stationary_kalman_filter(name: str, ratio: float) -> None:
+    model = MODELS[name]
+    found = gain_of(model, ratio)
+    gain, variance, cov = stationary(model, ratio)
+    assert model.to_state @ found.gain == pytest.approx(gain, rel=1e-3, abs=1e-4 * max(abs(gain)))
+    assert found.innovation**2 == pytest.approx(variance, rel=1e-3)
+    assert found.cov == pytest.approx(cov, rel=1e-2, abs=1e-3 * np.trace(cov))

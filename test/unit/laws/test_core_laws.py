@@ -1,0 +1,182 @@
+"""Laws beside the default one: (3.11) as printed, the gradient law, u reconstructed from y."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from strategies import (
+    NO_STATE,
+    PAPER_DENOMINATOR,
+    PAPER_NUMERATOR,
+    KnownInput,
+    eighths,
+    output_of,
+    plants,
+)
+
+from backlash_ros.core.assembly import build_controller, build_plant, build_reference
+from backlash_ros.core.control.inverse import BacklashInverse
+from backlash_ros.core.control.paper_structure import Proportional
+from backlash_ros.core.control.protocol import Command, ControlInput
+from backlash_ros.core.estimate import Bounds, Estimate, Status
+from backlash_ros.core.law import Interval
+from backlash_ros.core.laws.input_reconstruction import InputReconstruction
+from backlash_ros.core.laws.printed_law import PrintedLaw, printed_c, printed_f, printed_m
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.plant.transfer_function import TransferFunction
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
+from backlash_ros.core.simulation.run_record import RunRecord
+
+
+def feed(estimator: PrintedLaw, u: float, y_m: float) -> Estimate:
+    estimator.update(u, Interval(v=0.0, y_m=y_m, u_d=0.0, f=estimator.estimate.f))
+    return estimator.estimate
+
+
+WIDE = Bounds((1e-9, 1e9), (0.0, 1e9), (-1e9, 0.0))
+WIDE_F = (-1e9, 1e9)
+START = Estimate(0.696, 0.5, -0.5, 0.22)
+SMALL = eighths(-80, 80)
+
+
+def law(initial: Estimate = START, bounds: Bounds = WIDE,
+        f_bounds: tuple[float, float] = WIDE_F) -> PrintedLaw:
+    return PrintedLaw(initial, bounds, f_bounds, KnownInput())  # type: ignore[arg-type]
+
+
+def control(y_m: float, estimate: Estimate, inverse: BacklashInverse) -> Command:
+    return Proportional().control(ControlInput(y_m, 0.0, estimate, NO_STATE), inverse)
+
+
+@given(u=SMALL, y_m=SMALL, m=eighths(1, 80), w=SMALL)
+def test_printed_f_reduces_to_the_solution_of_e_equal_0(u, y_m, m, w):
+    assume(y_m + m * w != 0.0 and u + m * w != 0.0)
+    reduced = Fraction(m) * (Fraction(u) - Fraction(y_m)) / (Fraction(u) + Fraction(m * w))
+    assert printed_f(u, y_m, m, w) == float(reduced)
+
+
+@given(u=SMALL, y_m=SMALL, f=eighths(-80, 80), w=SMALL)
+def test_printed_m_reduces_to_the_solution_of_e_equal_0(u, y_m, f, w):
+    assume(f != 0.0 and y_m + f * w != 0.0 and u - y_m - f * w != 0.0)
+    assert printed_m(u, y_m, f, w) == float(Fraction(u) * Fraction(f) / Fraction(u - y_m - f * w))
+
+
+@given(u=SMALL, y_m=SMALL, f=eighths(-80, 80), m=eighths(1, 80))
+def test_printed_c_reduces_to_the_solution_of_e_equal_0(u, y_m, f, m):
+    assume(f != 0.0)
+    reduced = (Fraction(u) - Fraction(y_m)) / Fraction(f) - Fraction(u) / Fraction(m)
+    assert printed_c(u, y_m, f, m) == float(reduced)
+
+
+@given(data=st.lists(st.tuples(st.floats(-20.0, 20.0), st.floats(-20.0, 20.0)), max_size=40))
+def test_guarded_law_stays_finite_and_within_its_bounds(data: list[tuple[float, float]]) -> None:
+    bounds = Bounds()
+    estimator = law(bounds=bounds, f_bounds=(-0.5, 0.5))
+    for u, y_m in [(0.0, 0.0), *data]:
+        e = feed(estimator, u, y_m)
+        assert bounds.m[0] <= e.m <= bounds.m[1]
+        assert bounds.c_r[0] <= e.c_r <= bounds.c_r[1]
+        assert bounds.c_l[0] <= e.c_l <= bounds.c_l[1]
+        assert -0.5 <= e.f <= 0.5
+    # The paper's first sample, u = y_m = 0, leads to 0/0 in m and c.
+    assert estimator.skipped >= 1
+
+
+TRUTH = {'m': 1.3, 'c_r': 3.0, 'c_l': -3.0}
+
+
+def four_blocks(**changes: object) -> Parameters:
+    named = {name.replace('__', '.'): value for name, value in changes.items()}
+    return Parameters({
+        'structure': 'pole_placement', 'estimator.law': 'gradient', 'amplitude': 0.2, **named,
+    })
+
+
+def last(run: RunRecord) -> dict[str, float]:
+    return {name: float(run.column(name)[-1]) for name in TRUTH}
+
+
+@pytest.mark.parametrize('amplitude', [0.05, 0.2, 1.0])
+def test_learns_all_three_from_the_tracking_error(amplitude: float) -> None:
+    run = build_closed_loop(four_blocks(amplitude=amplitude)).run(2000)
+    assert last(run) == pytest.approx(TRUTH, rel=0.01)
+
+
+def test_says_that_y_moves_against_v() -> None:
+    p = four_blocks()
+    controller, plant, reference = build_controller(p), build_plant(p), build_reference(p)
+    for k in range(200):
+        step = controller.step(-plant.measure(), reference(k * 0.01))
+        plant.step(step.v)
+    assert step.estimate.status is Status.INCONSISTENT
+
+
+Array = np.ndarray
+LAG = 30
+PAPER = TransferFunction(PAPER_NUMERATOR, PAPER_DENOMINATOR)
+
+
+def play_output(samples: int = 400) -> Array:
+    return np.clip(14.0 * np.sin(0.126 * np.arange(samples)), -10.0, 10.0)
+
+
+def reconstructed(
+    reconstruction: InputReconstruction, y: Array, lost: tuple[int, ...] = (),
+) -> Array:
+    """u_hat, shifted so that element k belongs to u(k); nan where y is too short."""
+    lagged = [reconstruction.update(None if k in lost else float(y[k])) for k in range(len(y))]
+    result = np.full(len(y), np.nan)
+    result[: len(y) - reconstruction.lag] = lagged[reconstruction.lag:]
+    return result
+
+
+def error(model: TransferFunction, noise_std: float = 0.0, lag: int = LAG,
+          lost: tuple[int, ...] = (), samples: int = 400) -> Array:
+    """u_hat(k) - u(k) from k = 2 lag on, as long as y reaches."""
+    u = play_output(samples)
+    u_hat = reconstructed(InputReconstruction(model, noise_std, lag), output_of(model, u), lost)
+    return (u_hat - u)[2 * lag: samples - lag]
+
+
+@given(model=plants())
+def test_u_is_exact_after_the_lag_without_noise(model: TransferFunction) -> None:
+    assert np.abs(error(model)).max() < 1e-3
+
+
+@given(model=plants(), lost=st.sets(st.integers(100, 140), max_size=10))
+def test_lost_samples_do_not_put_it_out_of_step(model: TransferFunction, lost: set[int]) -> None:
+    late = error(model, lost=tuple(lost), samples=600)[300:]
+    assert np.abs(late).max() < 1e-3
+
+
+@pytest.mark.parametrize('noise_std', [1e-4, 1e-3])
+def test_it_is_the_least_squares_solution_of_random_walk_and_noise(noise_std: float) -> None:
+    """Against one batch solution over all samples, which knows no recursion."""
+    samples, lag = 200, 20
+    rng = np.random.default_rng(3)
+    y = output_of(PAPER, np.cumsum(rng.standard_normal(samples)))
+    y += noise_std * rng.standard_normal(samples)
+    impulse = output_of(PAPER, np.eye(1, samples)[0])
+    response = np.array([[impulse[i - j] if i >= j else 0.0 for j in range(samples)]
+                         for i in range(samples)])
+    walk = np.eye(samples) - np.eye(samples, k=-1)
+    batch, *_ = np.linalg.lstsq(
+        np.vstack([response / noise_std, walk]), np.append(y / noise_std, np.zeros(samples)),
+        rcond=None,
+    )
+    recursion = InputReconstruction(PAPER, noise_std, lag)
+    for value in y:
+        recursion.update(float(value))
+    assert recursion.u_hat == pytest.approx(batch[samples - 1 - lag], abs=1e-3)
+
+
+def test_lag_shorter_than_the_delay_of_the_plant_is_refused() -> None:
+    """y(k) cannot tell u(k - 3) yet when it takes u five samples to reach y."""
+    model = TransferFunction([1.0], [1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    with pytest.raises(ParameterError) as refusal:
+        InputReconstruction(model, 0.0, 3)
+    assert refusal.value.name == 'estimator.lag'
+    InputReconstruction(model, 0.0, 5)

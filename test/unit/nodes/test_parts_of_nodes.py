@@ -1,0 +1,138 @@
+"""Parts of the nodes on their own: profiles, numbers as bytes, sections, plots, precedence."""
+
+import struct
+from math import inf, isnan, nan
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rclpy.serialization import deserialize_message, serialize_message
+from std_msgs.msg import Float64
+
+from backlash_ros import topics
+from backlash_ros.middleware.loopback import PROFILE, prefer_loopback
+from backlash_ros.nodes.control.publishing import watched_values
+from backlash_ros.nodes.control.rivals import ENDPOINT, SINCE, Rival, Rivals
+from backlash_ros.nodes.runtime.messages import SILENT_S, message_with, number_of
+from backlash_ros.nodes.runtime.parameters import unused
+
+HERE = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
+
+
+def chosen(environment: dict[str, str]) -> str | None:
+    prefer_loopback(environment)
+    return environment.get('FASTRTPS_DEFAULT_PROFILES_FILE')
+
+
+@pytest.mark.parametrize(('environment', 'profile'), [
+    (HERE, PROFILE), ({**HERE, 'ROS_STATIC_PEERS': '192.168.0.2'}, PROFILE.with_stem('network')),
+    ({}, None), ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}, None),
+])
+def test_a_profile_follows_from_who_is_to_be_met(environment, profile) -> None:
+    assert chosen({**environment}) == (profile and str(profile))
+    assert profile is None or profile.is_file()
+
+
+def test_a_profile_of_the_user_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert chosen({**HERE, 'FASTRTPS_DEFAULT_PROFILES_FILE': 'own.xml'}) == 'own.xml'
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'DEFAULT_FASTRTPS_PROFILES.xml').touch()
+    assert chosen({**HERE}) is None
+
+
+NUMBERS = (0.0, -1.5, 1e-300, 12.345678901234567, inf, -inf)
+
+
+@pytest.mark.parametrize('number', NUMBERS)
+def test_a_number_goes_out_and_comes_in_as_a_float64(number: float) -> None:
+    assert deserialize_message(message_with(number), Float64).data == number
+    assert number_of(serialize_message(Float64(data=number))) == number
+
+
+def test_what_is_no_number_stays_none() -> None:
+    assert isnan(number_of(message_with(nan)))
+
+
+def test_a_sender_whose_highest_byte_comes_first_is_understood() -> None:
+    assert number_of(b'\x00\x00\x00\x00' + struct.pack('>d', -7.25)) == -7.25
+
+
+@pytest.mark.parametrize(('sections', 'full_name'), [
+    (['/**', '/plant'], '/arm/plant'), (['/arm/plant'], '/plant'), (['/plant'], '/left_plant'),
+    (['/plnt'], '/plant'),
+])
+def test_section_that_does_not_reach_its_node_is_named(sections, full_name):
+    assert list(unused(sections, 'plant', full_name)) == [sections[-1]]
+
+
+@pytest.mark.parametrize(('sections', 'full_name'), [
+    (['/**', '/plant'], '/plant'), (['/**/plant'], '/plant'), (['/**/plant'], '/a/b/plant'),
+    (['/*/plant'], '/a/plant'), (['/pan/plant', '/tilt/plant'], '/pan/plant'),
+    (['/**', '/tilt/plant'], '/pan/plant'), (['/**', '/controller', '/somebody_else'], '/plant'),
+    (['/tilt/**'], '/pan/plant'),
+])
+def test_other_sections_are_no_concern(sections: list[str], full_name: str) -> None:
+    assert list(unused(sections, 'plant', full_name)) == []
+
+
+SIGNALS = tuple(float(i) for i, _ in enumerate(topics.SIGNAL_LABELS))
+ESTIMATES = (1.3, 3.0, -2.0, 0.2, 0.1, 0.2, 0.3, nan, 7.0)
+
+
+def test_values_are_those_of_the_rows_with_bands_of_two_deviations() -> None:
+    values = watched_values(SIGNALS, ESTIMATES)
+    assert set(values) == set(topics.WATCH_LABELS)
+    assert (values['m'], values['c_r'], values['c_l'], values['gap']) == (1.3, 3.0, -2.0, 5.0)
+    assert (values['m_low'], values['m_high']) == pytest.approx((1.1, 1.5))
+    assert (values['c_l_low'], values['c_l_high']) == pytest.approx((-2.6, -1.4))
+    for label in ('y_m', 'y', 'u_d', 'v', 'u_hat', 'innovation', 'status', 'latency_s'):
+        assert values[label] == SIGNALS[topics.SIGNAL_LABELS.index(label)]
+
+
+def rivals_of(own: str = 'b', active_at: float = 10.0, since_ns: int = 100) -> Rivals:
+    rivals = Rivals(own, settled_at=5.0)
+    rivals.begin(since_ns, active_at)
+    return rivals
+
+
+def claim(identity: str, since_ns: int) -> dict[str, Any]:
+    return {ENDPOINT: identity, SINCE: str(since_ns)}
+
+
+@pytest.mark.parametrize(('identity', 'since_ns', 'was_first'), [
+    ('x', 99, True), ('x', 101, False), ('a', 100, True), ('c', 100, False),
+])
+def test_the_time_of_activation_decides_and_the_identity_where_it_is_equal(
+    identity: str, since_ns: int, was_first: bool,
+) -> None:
+    rivals = rivals_of()
+    rivals.hear(claim(identity, since_ns), 10.0)
+    rivals.among({identity: '/other'}, 10.0)
+    rivals.hear(claim(identity, since_ns), 10.5)
+    assert rivals.among({identity: '/other'}, 11.0) == (Rival('/other', was_first),)
+
+
+def test_without_a_word_presence_at_activation_decides() -> None:
+    rivals = rivals_of(active_at=10.0)
+    rivals.among({'x': '/early'}, 9.0)
+    found = rivals.among({'x': '/early', 'y': '/late'}, 11.0)
+    assert found == (Rival('/early', True), Rival('/late', False))
+
+
+def test_a_controller_that_says_nothing_any_more_is_gone_though_discovery_still_has_it() -> None:
+    rivals = rivals_of()
+    rivals.among({'x': '/other'}, 9.0)
+    rivals.hear(claim('x', 50), 10.0)
+    assert rivals.among({'x': '/other'}, 10.0 + 0.9 * SILENT_S) == (Rival('/other', True),)
+    assert rivals.among({'x': '/other'}, 10.0 + 1.1 * SILENT_S) == ()
+
+
+def test_who_is_inactive_has_no_rivals_and_is_none() -> None:
+    rivals = rivals_of()
+    rivals.among({'x': '/other'}, 9.0)
+    rivals.hear(claim('x', 0), 10.0)
+    assert rivals.among({'x': '/other'}, 10.1) == ()
+    rivals.hear(claim('x', 50), 10.2)
+    assert rivals.among({'x': '/other'}, 10.3) == (Rival('/other', True),)
+    rivals.begin(0, 10.35)
+    assert rivals.among({'x': '/other'}, 10.4) == ()

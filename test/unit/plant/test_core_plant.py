@@ -1,0 +1,194 @@
+"""What is simulated: backlash (2.1), G(z), the sensor (3.1), and a true G(z) that is another."""
+
+from fractions import Fraction
+from itertools import accumulate, islice
+from math import pi
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.signal import cont2discrete, lfilter
+from strategies import eighths, output_of, paper_example, plants, signals, usual_plays
+
+from backlash_ros.core.assembly import build_model, build_plant, build_true_model
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.plant.backlash import Backlash, Region, clamp, play
+from backlash_ros.core.plant.simulated_plant import SimulatedPlant, altered_plant
+from backlash_ros.core.plant.transfer_function import TransferFunction
+
+
+def as_printed(u_before: Fraction, v: Fraction, m: Fraction, c_r: Fraction, c_l: Fraction,
+               ) -> tuple[Fraction, Region]:
+    """The three cases of (2.1), word for word, in exact arithmetic."""
+    v_l = u_before / m + c_l
+    v_r = u_before / m + c_r
+    if v <= v_l:
+        return m * (v - c_l), Region.LEFT
+    if v >= v_r:
+        return m * (v - c_r), Region.RIGHT
+    return u_before, Region.GAP
+
+
+@given(
+    m=eighths(1, 40), c_l=eighths(-80, 40), gap=eighths(1, 80), u=eighths(-400, 400),
+    signal=st.lists(eighths(-160, 160), min_size=1, max_size=40),
+)
+def test_clamp_equals_the_three_printed_cases(m, c_l, gap, u, signal):
+    backlash = Backlash(m, c_l + gap, c_l, u)
+    expected = Fraction(u)
+    for v in signal:
+        expected, region = as_printed(
+            expected, Fraction(v), Fraction(m), Fraction(c_l + gap), Fraction(c_l)
+        )
+        assert backlash.step(v) == expected
+        assert backlash.region == region
+
+
+values = st.floats(-10.0, 10.0)
+
+
+@given(v=st.lists(values, min_size=1, max_size=40), gaps=st.lists(
+    st.floats(0.0, 5.0), min_size=1, max_size=3), before=values)
+def test_stepping_the_turns_alone_leaves_nothing_out(v, gaps, before):
+    stepped = [
+        list(islice(accumulate(v, lambda p, x, g=gap: clamp(p, x, x + g), initial=before), 1, None))
+        for gap in gaps
+    ]
+    assert play(np.array(v), gaps[0], before).tolist() == stepped[0]
+    assert play(np.array(v), np.array(gaps), np.full(len(gaps), before)).tolist() == stepped
+
+
+SLOW = TransferFunction([0.1], [1.0, -0.9])
+
+
+def plant(**values: object) -> SimulatedPlant:
+    return SimulatedPlant(Parameters(values), SLOW)
+
+
+def outputs(simulated: SimulatedPlant, control: list[float]) -> list[float]:
+    result = []
+    for v in control:
+        result.append(simulated.measure())
+        simulated.step(v)
+    return result
+
+
+@given(model=plants(), play=usual_plays(), control=signals(), disturbance=st.floats(-5.0, 5.0))
+def test_y_is_g_of_the_backlash_output_plus_the_disturbance(model, play, control, disturbance):
+    simulated = SimulatedPlant(Parameters({
+        'backlash.m': play.m, 'backlash.c_r': play.c_r, 'backlash.c_l': play.c_l,
+        'input_disturbance': disturbance,
+    }), model)
+    backlash = Backlash(play.m, play.c_r, play.c_l)
+    u = np.array([backlash.step(v) for v in control])
+    expected = output_of(model, u + disturbance)
+    np.testing.assert_allclose(
+        outputs(simulated, control), expected, atol=1e-9 * (1.0 + np.abs(expected).max())
+    )
+
+
+@given(control=signals(), quantum=st.floats(0.001, 1.0))
+def test_quantised_output_is_the_nearest_multiple(control: list[float], quantum: float) -> None:
+    exact = outputs(plant(), control)
+    coarse = outputs(plant(output_quantum=quantum), control)
+    for y, shown in zip(exact, coarse, strict=True):
+        assert abs(shown - y) <= 0.5 * quantum * (1.0 + 1e-9)
+        assert shown / quantum == pytest.approx(round(shown / quantum), abs=1e-6)
+
+
+def test_wear_moves_the_backlash_with_time_and_the_jump_comes_at_its_time() -> None:
+    simulated = plant(**{
+        'backlash.rate': (0.1, 1.0, -2.0), 'backlash.jump_time': 0.5,
+        'backlash.jump': (0.0, 1.0, 0.0), 'sample_period': 0.1,
+    })
+    seen = []
+    for _ in range(11):
+        simulated.step(0.0)
+        seen.append((simulated.backlash.m, simulated.backlash.c_r, simulated.backlash.c_l))
+    assert seen[0] == pytest.approx((1.3, 3.0, -3.0))
+    assert seen[4] == pytest.approx((1.34, 3.4, -3.8))
+    assert seen[5] == pytest.approx((1.35, 4.5, -4.0))
+    assert seen[10] == pytest.approx((1.4, 5.0, -5.0))
+
+
+@pytest.mark.parametrize('changes', [
+    {'backlash__jump': [-2.0, 0.0, 0.0]}, {'backlash__jump': [0.0, -3.0, 3.0]},
+    {'backlash__rate': [-1.0, 0.0, 0.0]},
+], ids=['jump to m < 0', 'jump to c_l = c_r', 'm falls below 0 after 1.3 s'])
+def test_wear_never_ends_in_an_invalid_backlash(changes: dict[str, list[float]]) -> None:
+    """It is refused at the start, or when it gets there, but never simulated."""
+    with pytest.raises(ParameterError) as refusal:
+        outputs(build_plant(paper_example(**changes)), [0.0] * 400)
+    assert refusal.value.name.startswith('backlash.')
+
+
+PERIOD = 0.005
+
+
+def motor(frequency: float = 20.0, damping: float = 0.5) -> TransferFunction:
+    """The load of geared_motor.yaml by an independent discretisation."""
+    w = 2.0 * pi * frequency
+    numerator, denominator, _ = cont2discrete(
+        ([w * w], [1.0, 2.0 * damping * w, w * w]), PERIOD, 'zoh'
+    )
+    return TransferFunction(np.ravel(numerator).tolist(), denominator.tolist())
+
+
+def assert_equal(found: TransferFunction, expected: TransferFunction, tolerance: float) -> None:
+    np.testing.assert_allclose(found.numerator, expected.numerator, rtol=0.0, atol=tolerance)
+    np.testing.assert_allclose(found.denominator, expected.denominator, rtol=0.0, atol=tolerance)
+
+
+def step_response(model: TransferFunction, samples: int) -> NDArray[np.float64]:
+    return np.asarray(lfilter(model.numerator, model.denominator, np.ones(samples)))
+
+
+def continuous(model: TransferFunction) -> bool:
+    poles = model.poles
+    return not np.any((poles.real <= 0.0) & (np.abs(poles.imag) < 1e-3))
+
+
+@pytest.mark.parametrize('factor', [0.5, 0.8, 0.98, 1.02, 1.2, 1.5])
+def test_scaled_frequency_is_the_motor_at_that_frequency(factor: float) -> None:
+    assert_equal(altered_plant(motor(), frequency=factor), motor(20.0 * factor), 1e-12)
+
+
+@given(plants(), st.integers(0, 2), st.integers(1, 3))
+def test_lag_by_a_part_of_a_sample_shifts_the_response_by_that_part(model, whole, quarters):
+    assume(continuous(model))
+    lagging = step_response(altered_plant(model, lag=whole + 0.25 * quarters), 60)
+    # A quarter of the frequency shows the response between the samples as well.
+    slow = step_response(altered_plant(model, frequency=0.25), 240)
+    if np.any(np.abs(model.poles - 1.0) < 1e-6):
+        slow = slow * 0.25
+    expected = np.append(np.zeros(whole + 1), slow[4 - quarters::4])[:60]
+    np.testing.assert_allclose(lagging, expected, rtol=0.0, atol=1e-7 * np.abs(slow).max())
+
+
+def test_plant_that_no_continuous_one_has_is_refused_with_its_pole() -> None:
+    ringing = TransferFunction([1.0], [1.0, 0.25])
+    with pytest.raises(ParameterError, match=r'pole -0\.25.*negative real axis.*truth\.numerator'):
+        altered_plant(ringing, frequency=1.2)
+    # Whole samples of dead time need no continuous plant.
+    assert altered_plant(ringing, lag=2.0).delay == 3
+
+
+def test_given_plant_takes_the_place_of_the_known_one_in_the_simulation_alone() -> None:
+    known = Parameters({'control.delay_samples': 1})
+    p = known.replaced({
+        'truth.numerator': [0.3], 'truth.denominator': [1.0, -0.5, 0.06], 'truth.delay_samples': 3,
+    })
+    assert_equal(
+        build_true_model(p), TransferFunction([0.3], [1.0, -0.5, 0.06, 0.0, 0.0, 0.0]), 0.0
+    )
+    assert_equal(build_model(p), build_model(known), 0.0)
+    denominator = p.replaced({'truth.numerator': [], 'truth.denominator': [1.0, -2.8, 2.7, -0.9]})
+    assert build_true_model(denominator).numerator.max() == max(p.plant.numerator)
+
+
+def test_bad_truth_is_named_as_such() -> None:
+    with pytest.raises(ParameterError, match=r'truth\.numerator=.* of truth\.denominator'):
+        build_plant(Parameters({'truth.numerator': [1.0, 2.0], 'truth.denominator': [1.0, 0.5]}))
