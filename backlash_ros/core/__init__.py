@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from backlash_ros.core.assembly import build_controller, build_plant, build_reference
-    from backlash_ros.core.driver_check.record_fit import fit_record
     from backlash_ros.core.estimate import Estimate, Status
     from backlash_ros.core.parameters import Parameters
+    from backlash_ros.core.record_fit import fit_record
     from backlash_ros.core.simulation.closed_loop import build_closed_loop
 
 __all__ = [
@@ -27,7 +27,7 @@ _HOMES = {
     'Estimate': 'estimate', 'Parameters': 'parameters', 'Status': 'estimate',
     'build_closed_loop': 'simulation.closed_loop', 'build_controller': 'assembly',
     'build_plant': 'assembly', 'build_reference': 'assembly',
-    'fit_record': 'driver_check.record_fit',
+    'fit_record': 'record_fit',
 }
 
 

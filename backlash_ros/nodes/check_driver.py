@@ -40,7 +40,7 @@ class CheckDriverNode(MotionNode):
         self.exit_code = DONE if all_fit(findings) else FAILED
 
     def _save(self, path: Path) -> None:
-        record = timing_of(self.heard, self.settings.sample_period).record(self.heard)
+        record = timing_of(self.heard, self.settings.sample_period).record
         if record is None:
             self.say(f'nothing to save in {path}: v and y were not both heard')
             return

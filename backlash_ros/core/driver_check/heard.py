@@ -1,7 +1,4 @@
-"""What was heard of a driver: messages, the ROS graph, and its samples, counted.
-
-Pure: no ROS in here, so that every judgement can be tried on made-up messages.
-"""
+"""What was heard of a driver, without ROS: messages, the ROS graph, and its samples, counted."""
 
 from __future__ import annotations
 
@@ -12,14 +9,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.control.limits import plausible
+from backlash_ros.core.control.limits import LARGEST_SIGNAL, plausible
 from backlash_ros.core.loop.command_history import v_of_intervals
 from backlash_ros.core.loop.sample_counter import UNNUMBERED, SampleCounter
 
 Array = NDArray[np.float64]
 
 FEWEST_SAMPLES = 20  # for a judgement of the timing
-MOST_LATE = 0.5  # of a period: beyond 0.85 the controller takes it for a loss
 
 
 class Message(NamedTuple):
@@ -35,9 +31,9 @@ class Message(NamedTuple):
 class Graph:
     """What the ROS graph says about the topics of the driver.
 
-    publishers, types, best_effort (without guarantee): of plant_output. listeners: of control,
-    without the tools of this package. misfits: reasons why messages cannot pass, from QoS.
-    near_control: subscribed topics of a name like control.
+    publishers, types, best_effort: of plant_output. listeners: of control, without the tools of
+    this package. misfits: reasons why messages cannot pass, from QoS. near_control: subscribed
+    topics of a name like control.
     """
 
     publishers: int = 0
@@ -64,95 +60,74 @@ class Heard:
                 'applied_control': self.applied}
 
 
-class Timing(NamedTuple):
-    """Samples without repetitions: their messages, their count from 0, and the period found.
+class Sampling(NamedTuple):
+    """Samples without repetitions, a row each, their count from 0 and their period.
 
-    repeated: with the value of the one before. early: with another value, but long before they were
-    due. lateness: of a period, exceeded by 1 % of the samples. fits: the period is the one of the
-    parameters.
+    commanded, reported: v over each sample interval (N,), nan before any; None where nothing tells
+    it. repeated: with the value of the one before. early: with another value, but long before they
+    were due. lateness: of a period, exceeded by 1 % of the samples. bursts: they are so late that
+    they cannot be counted for certain.
     """
 
-    outputs: list[Message]
+    outputs: NDArray[np.void]
     numbers: NDArray[np.int64]
     period_s: float
     missing: int = 0
     repeated: int = 0
     early: int = 0
     lateness: float = 0.0
-    fits: bool = True
+    bursts: bool = False
+    commanded: Array | None = None
+    reported: Array | None = None
 
-    def v_of(self, messages: Sequence[Message], reported: bool) -> Array | None:
-        """v over each sample interval (N,), nan before any; None where nothing tells it.
-
-        reported: whether the messages are those of applied_control.
-        """
-        usable = [message for message in messages if plausible(message.value)]
-        if not usable or not self.outputs:
-            return None
-        v = v_of_intervals(self.numbers, stamps_of(self.outputs), stamps_of(usable),
-                           np.array([message.value for message in usable]), reported)
-        return v if np.isfinite(v).any() else None
-
-    def record(self, heard: Heard) -> tuple[Array, Array] | None:
-        """v from sample k to k+1, as reported or else commanded, and y at k, nan where lost.
-
-        From the first known v on; None where v or y was not heard.
-        """
-        v = self.v_of(heard.applied, True)
-        v = self.v_of(heard.controls, False) if v is None else v
+    @property
+    def record(self) -> tuple[Array, Array] | None:
+        """v from sample k to k+1 and y at k, nan where lost, from the first known v on, if any."""
+        v = self.commanded if self.reported is None else self.reported
         if v is None:
             return None
-        y = np.full(len(v), np.nan)
-        y[self.numbers] = [m.value if plausible(m.value) else np.nan for m in self.outputs]
+        y, values = np.full(len(v), np.nan), self.outputs['value']
+        y[self.numbers] = np.where(np.abs(values) <= LARGEST_SIGNAL, values, np.nan)
         known = int(np.argmax(np.isfinite(v)))
         return v[known:], y[known:]
 
 
-def timing_of(heard: Heard, sample_period_s: float) -> Timing:
+def timing_of(heard: Heard, sample_period_s: float) -> Sampling:
     """Sort out what came twice or early, and count the samples; none where they are too few."""
-    outputs = _without_doubles(heard.outputs, 0.25e9 * sample_period_s)
-    repeated = len(heard.outputs) - len(outputs)
-    if repeated > 0.6 * len(heard.outputs):  # a plant at rest
-        outputs, repeated = heard.outputs, 0
-    if len(outputs) < FEWEST_SAMPLES:
-        return Timing([], np.zeros(0, dtype=np.int64), sample_period_s, repeated=repeated)
-    rough = max(float(np.median(np.diff(stamps_of(outputs)))), 1.0)
+    fields = [('value', 'f8'), ('stamp_ns', 'i8'), ('received_ns', 'i8'), ('number', 'u8')]
+    sent = np.array(heard.outputs, fields)
+    before = np.roll(sent, 1)
+    same_number = sent['number'] == before['number']
+    again = (sent['stamp_ns'] - before['stamp_ns'] <= 0.25e9 * sample_period_s) & (
+        (sent['value'] == before['value']) | (same_number & (sent['number'] != UNNUMBERED)))
+    again[:1] = False
+    repeated = int(again.sum())
+    if repeated > 0.6 * len(sent):  # a plant at rest
+        again[:], repeated = False, 0
+    # No gaps in the numbers where they were.
+    sent['number'] -= np.cumsum(again & ~same_number, dtype=np.uint64)
+    sent = sent[~again]
+    if len(sent) < FEWEST_SAMPLES:
+        return Sampling(sent[:0], np.zeros(0, dtype=np.int64), sample_period_s)
+    rough = max(float(np.median(np.diff(sent['stamp_ns']))), 1.0)
     counter = SampleCounter(rough * 1e-9)
-    index, missing, samples = [], 0, []
-    for message in outputs:
-        arrival = counter.count(message.stamp_ns, message.number)
-        if arrival.is_sample:
-            missing += arrival.missing
-            index.append(counter.index)
-            samples.append(message)
-    times = (stamps_of(samples) - samples[0].stamp_ns) * 1e-9
-    numbers = np.array(index, dtype=np.int64) - index[0]
-    slope = float(np.polyfit(numbers, times, 1)[0])
-    lateness = float(np.ptp(np.quantile(times - slope * numbers, [0.01, 0.99]))) / slope
+    index = np.array([counter.index if counter.count(stamp_ns, number).is_sample else -1
+                      for _, stamp_ns, _, number in sent.tolist()])
+    outputs, numbers = sent[index >= 0], index[index >= 0] - index[0]
+    stamps = outputs['stamp_ns']
+    times = (stamps - stamps[0]) * 1e-9
+    period = float(np.polyfit(numbers, times, 1)[0])
+    lateness = float(np.ptp(np.quantile(times - period * numbers, [0.01, 0.99]))) / period
+    bursts = lateness > 0.5  # beyond 0.85 the controller takes it for a loss
     # A driver that fell silent for good loses samples as well.
-    missing += max(int((heard.end_ns - samples[-1].stamp_ns) / rough) - 1, 0)
-    # Amid bursts the samples cannot be counted for certain; most intervals tell the period still.
-    period, most_off = (slope, 0.01) if lateness <= MOST_LATE else (rough * 1e-9, 0.1)
-    fits = abs(period / sample_period_s - 1.0) <= most_off
-    return Timing(
-        samples, numbers, period, missing, repeated, len(outputs) - len(samples), lateness, fits)
+    silent = max(int((heard.end_ns - stamps[-1]) / rough) - 1, 0)
 
+    def v_of(messages: Sequence[Message], reported: bool) -> Array | None:
+        told = np.array([m for m in messages if plausible(m.value)], fields)
+        v = v_of_intervals(numbers, stamps, told['stamp_ns'], told['value'], reported)
+        return v if np.isfinite(v).any() else None
 
-def stamps_of(messages: Sequence[Message]) -> NDArray[np.int64]:
-    """When they left [ns]."""
-    return np.array([message.stamp_ns for message in messages], dtype=np.int64)
-
-
-def _without_doubles(outputs: Sequence[Message], soon_ns: float) -> list[Message]:
-    """Without those that came again so soon; no gaps in the numbers where they were."""
-    kept: list[Message] = []
-    doubles = 0
-    for message in outputs:
-        if message.number != UNNUMBERED:
-            message = message._replace(number=message.number - doubles)
-        if kept and message.stamp_ns - kept[-1].stamp_ns <= soon_ns and (
-                message.value == kept[-1].value or message.number == kept[-1].number != UNNUMBERED):
-            doubles += message.number != kept[-1].number
-        else:
-            kept.append(message)
-    return kept
+    return Sampling(
+        outputs, numbers, rough * 1e-9 if bursts else period,
+        int(numbers[-1]) + 1 - len(outputs) + silent, repeated, len(sent) - len(outputs), lateness,
+        bursts, v_of(heard.controls, False), v_of(heard.applied, True))

@@ -1,0 +1,135 @@
+"""What a whole record says, G being roughly known, by the fit of the loop over all its samples."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from math import inf, nan
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.estimate import Bounds
+from backlash_ros.core.estimation import explanations, settings
+from backlash_ros.core.estimation.plant_family import PlantFamily
+from backlash_ros.core.estimation.posterior import WindowFit
+from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
+from backlash_ros.core.records.samples import check_record, outliers
+from backlash_ros.core.simulation.metrics import turns
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RecordFit:
+    """What a record says. u = m (p - c_r) with the play output p for the gap c_r - c_l.
+
+    nominal: G as it was given. model: the G that was learned, the same where the data do not speak
+    for another one; both without `delay` [samples]. reasons: why it is of no use to the loop, a
+    sentence each: `doubts` of the values, `against` for y that moves against v, `outside` of the
+    bounds. estimates: value and standard deviation of m (negative where y moves against v), c_r,
+    c_l. fit: None where there is none, of -G where m is negative. predicted: share of the motion of
+    y that it predicts. reversals: of the play output. margins: log-likelihood by which each of the
+    delays that were compared falls behind.
+    """
+
+    nominal: TransferFunction
+    model: TransferFunction
+    doubts: tuple[str, ...] = ()
+    against: tuple[str, ...] = ()
+    outside: tuple[str, ...] = ()
+    estimates: Mapping[str, tuple[float, float]] = field(
+        default_factory=lambda: dict.fromkeys(('m', 'c_r', 'c_l'), (nan, nan)))
+    gap: float = nan
+    std_gap: float = nan
+    fit: WindowFit | None = None
+    predicted: float = nan
+    reversals: int = 0
+    delay: int = 0
+    margins: Mapping[int, float] = field(default_factory=dict)
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        return (*self.against, *self.doubts, *self.outside)
+
+    @property
+    def usable(self) -> bool:
+        """Whether m, c_r and c_l are known as well as the loop wants to know them."""
+        return not self.reasons
+
+    def error_of_model(self, frequencies: Sequence[float]) -> Array:
+        """|G_learned / G_nominal - 1| at frequencies (N,) [rad/sample], but for that at rest."""
+        z = np.exp(1j * np.asarray(frequencies, dtype=float))
+        return np.asarray(np.abs(self.model.response(z) / self.nominal.response(z) - 1.0))
+
+
+def fit_record(
+    v: Array, y: Array, model: TransferFunction | StateModel, uncertainty: float,
+    noise_std: float, bounds: Bounds | None = None, delays: Sequence[int] = (0,),
+) -> RecordFit:
+    """Fit v (N,), applied from k to k+1, and y (N,) at k, nan where lost.
+
+    model: G without delay of v. uncertainty: relative spread of its time constants, damping and
+    delay, 0 where it is exact. noise_std: of y, a first guess. delays: of v [samples], of which the
+    likeliest is taken. Raises ValueError for arrays and delays that are none.
+    """
+    v, y = np.asarray(v, dtype=float), np.asarray(y, dtype=float)
+    check_record(v, y)
+    if not delays or min(delays) < 0:
+        raise ValueError(f'delays={delays!r} must name at least one, none of them negative')
+    nominal = model.transfer_function if isinstance(model, StateModel) else model
+    longest = max(delays)
+    # y(k+1) follows v(k - delay); all delays are compared over the same samples of y.
+    after = y[longest + 1:]
+    few = np.count_nonzero(np.isfinite(after)) < 10 * (nominal.order + 2)
+    if few or np.ptp(v) == 0.0:
+        why = f'too few samples: {len(after)} after the longest delay' if few else 'v stood still'
+        return RecordFit(nominal, nominal, (why,))
+    setup = explanations.Setup(PlantFamily(nominal, uncertainty), noise_std, bounds or Bounds(),
+                               inf, float(np.ptp(v)), 0.0, np.zeros(3))
+    fits = [replace(_fitted(setup, v[longest - delay:len(v) - 1 - delay], after, bounds),
+                    delay=delay) for delay in delays]
+    evidence = {each.delay: each.fit.evidence if each.fit else -inf for each in fits}
+    best = max(fits, key=lambda each: evidence[each.delay])
+    return replace(best, margins={
+        delay: evidence[best.delay] - other for delay, other in evidence.items()})
+
+
+def _fitted(setup: explanations.Setup, v: Array, y: Array, bounds: Bounds | None) -> RecordFit:
+    """Fit v (N,) and y (N,) after it, or -y where y moves against v."""
+    family, swing = setup.family, float(np.ptp(v))
+    record = explanations.Window(0, v, y, np.full(len(v), nan))
+    fit, sign = explanations.afresh(setup, record), 1.0
+    if fit is not None and fit.m < 0.0:
+        record, sign = record._replace(y=-y), -1.0
+        fit = explanations.afresh(setup, record)
+    if fit is None or not fit.valid:
+        why = f'y shows nothing of v, which swung by {swing:.4g}'
+        return RecordFit(family.model, family.model, (why,))
+    problem = explanations.problem_of(setup, record)
+    wild = outliers(problem.residual(fit), setup.noise_std)
+    if wild.any():
+        record = record._replace(y=np.where(wild, nan, record.y))
+        problem = explanations.problem_of(setup, record)
+        fit = explanations.afresh(setup, record, also=fit) or fit
+    reversals = turns(np.append(fit.p0, problem.input(fit)[0]), 5.0 * fit.gap_std)
+    wanted = settings.REVERSALS if family.count else 1
+    values, stds = (fit.crossings * [sign, 1.0, 1.0]).tolist(), fit.crossings_std.tolist()
+    doubts = {
+        f'v crossed the gap {reversals} times; {wanted} at least are needed to tell both '
+        'crossings': reversals < wanted,
+        f'm is known to {stds[0]:.2g} only': not stds[0] <= settings.STD_SLOPE * fit.m,
+        # A gap of 0 is known to 1 % of the swing.
+        f'the gap, about {fit.gap:.4g}, is known to {fit.gap_std:.2g} only':
+            not fit.gap_std <= max(settings.STD_GAP * fit.gap, 0.01 * swing),
+    }
+    outside = explanations.outside_bounds(bounds, fit) if bounds else ()
+    off = family.count and fit.behind(np.zeros(family.count)) > 1.0
+    return RecordFit(
+        family.model, family.model_at(fit.xi) if off else family.model,
+        tuple(text for text, true in doubts.items() if true),
+        (f'y moves against v: m would be {values[0]:.4g}',) if sign < 0.0 else (),
+        tuple(f'{name} would be {value:.4g}, outside [{low:g}, {high:g}]'
+              for name, value, (low, high) in outside),
+        dict(zip(('m', 'c_r', 'c_l'), zip(values, stds, strict=True), strict=True)), fit.gap,
+        fit.gap_std, fit, 1.0 - fit.left.rms / max(float(np.nanstd(record.y)), 1e-300), reversals)
