@@ -2,17 +2,21 @@
 
     python benchmarks/joints.py --law lms --rate 100 --seconds 20
 
-A node of the benchmark is the driver of all joints: it publishes a message of outputs every period
-and waits for the commands that answer it. Processor time and memory are those of all processes of
-the controllers, workers included; ratios of them say more than the figures of a busy machine.
+A node of the benchmark is the driver of all joints, six simulated plants with play: it publishes
+their outputs every period, waits for the commands that answer them, and asks a bare rclpy node that
+answers with what it gets half a period later. Processor time and memory are those of all processes
+of the controllers, workers included, once the backlash is known; ratios of them say more than the
+figures of a busy machine.
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import closing
+from functools import partial
 from math import sin
 from pathlib import Path
 
@@ -25,15 +29,19 @@ from reporting import text_table
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, Header
 
+from backlash_ros.core.assembly import build_plant
+from backlash_ros.core.parameters import Parameters
+
 JOINTS = tuple(f'joint_{i}' for i in range(1, 7))
-WARM_UP = 0.25  # share of the samples before anything is measured
+WARM_UP_S = 6.0  # acquisition is not counted
 MEETING_S = 60.0  # longest wait until all listen
+NOISE_STD = 4.4e-4  # of y, that of an encoder with 12 bits
 # A servo of 4 Hz at 100 Hz; at other rates it is another one, which costs the same.
 COMMON: dict[str, object] = {
     'structure': 'tracking', 'tracking.preview': 20, 'plant.numerator': [0.02, 0.018],
     'plant.denominator': [1.0, -1.75, 0.79], 'estimator.initial.m': 1.0,
     'estimator.initial.c_r': 0.01, 'estimator.initial.c_l': -0.01, 'control.rate_max': 5.0,
-    'control.min': -3.0, 'control.max': 3.0, 'estimator.output_noise_std': 4.4e-4,
+    'control.min': -3.0, 'control.max': 3.0, 'estimator.output_noise_std': NOISE_STD,
 }
 
 
@@ -53,80 +61,122 @@ def commands(together: bool, law: str, period_s: float) -> dict[str, list[str]]:
 
 
 class Driver(MeasuringNode):
-    """Publishes references and outputs of all joints, and counts the commands that come."""
+    """The plants of all joints: publishes references and outputs, and takes the commands.
 
-    def __init__(self, domain: int, together: bool) -> None:
+    heard: messages of commands so far. echoed: answers of the echo so far.
+    """
+
+    def __init__(self, domain: int, together: bool, rate: float) -> None:
         super().__init__(domain)
-        self.heard, self._together = 0, together
-        self._states = self.node.create_publisher(JointState, 'robot_joint_states', 10)
-        heard = [(JointState, 'joint_commands')] if together else [
-            (Float64MultiArray, f'{joint}/commands') for joint in JOINTS]
-        for kind, topic in heard:
-            self.node.create_subscription(kind, topic, self._count, 100)
-        told = [(JointState, 'robot_joint_command')] if together else [
-            (Float64, f'{joint}/reference') for joint in JOINTS]
-        self._references = [self.node.create_publisher(*of, 10) for of in told]
+        self.heard = self.echoed = 0
+        self._together, self._rate = together, rate
+        self._plants = [build_plant(Parameters({
+            **COMMON, 'sample_period': 1.0 / rate, 'backlash.m': 1.0, 'backlash.c_r': 0.012,
+            'backlash.c_l': -0.011, 'output_noise_std': NOISE_STD, 'seed': i,
+        })) for i in range(len(JOINTS))]
+        self._v = [0.0] * len(JOINTS)
+        node = self.node
+        self._states = node.create_publisher(JointState, 'robot_joint_states', 10)
+        self._question = node.create_publisher(Float64, 'echo/in', 1)
+        node.create_subscription(Float64, 'echo/out', self._take_echo, 1)
+        if together:
+            node.create_subscription(JointState, 'joint_commands', self._take_all, 100)
+            self._references = [node.create_publisher(JointState, 'robot_joint_command', 10)]
+        else:
+            for i, joint in enumerate(JOINTS):
+                node.create_subscription(
+                    Float64MultiArray, f'{joint}/commands', partial(self._take, i), 100)
+            self._references = [
+                node.create_publisher(Float64, f'{joint}/reference', 10) for joint in JOINTS]
 
-    def _count(self, message: object) -> None:
+    def _take_all(self, message: JointState) -> None:
+        self._v = list(message.position)
         self.heard += 1
+
+    def _take(self, i: int, message: Float64MultiArray) -> None:
+        self._v[i] = message.data[0]
+        self.heard += 1
+
+    def _take_echo(self, message: Float64) -> None:
+        self.echoed += 1
 
     def all_listen(self) -> bool:
         """Whether every controller hears both its reference and its output."""
         return self._states.get_subscription_count() >= len(self._references) and all(
-            each.get_subscription_count() for each in self._references)
+            each.get_subscription_count() for each in (*self._references, self._question))
 
-    def sample(self, t: float, period_s: float) -> float:
-        """One period, beginning now; returns the time until all commands were there [s], or nan."""
-        y_m, y = ([0.3 * sin(0.8 * t + i - late) for i in range(len(JOINTS))] for late in (0, 0.1))
+    def sample(self, k: int) -> tuple[float, float]:
+        """Period k, beginning now; times until all commands and the echo were there [s], or nan."""
+        period_s, begin = 1.0 / self._rate, time.perf_counter()
+        # The same motion per sample at every rate, as G is given in samples.
+        y_m = [0.3 * sin(0.02 * k + i) for i in range(len(JOINTS))]
+        y = [plant.measure() for plant in self._plants]
+        stamp_ns, heard, asked = time.time_ns(), self.heard, time.perf_counter()
+        self._states.publish(JointState(
+            header=Header(stamp=Time(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)),
+            name=JOINTS, position=y,
+        ))
+        wanted = heard + len(self._references)
+        answered_s = self._time_until(lambda: self.heard >= wanted, asked, begin + period_s)
         if self._together:
             self._references[0].publish(JointState(name=JOINTS, position=y_m))
         else:
             for publisher, value in zip(self._references, y_m, strict=True):
                 publisher.publish(Float64(data=value))
-        begin, stamp_ns, before = time.perf_counter(), time.time_ns(), self.heard
-        self._states.publish(JointState(
-            header=Header(stamp=Time(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)),
-            name=JOINTS, position=y,
-        ))
-        while self.heard < before + len(self._references):
-            left = period_s - (time.perf_counter() - begin)
+        self._wait_until(begin + 0.5 * period_s)
+        asked, echoed = time.perf_counter(), self.echoed
+        self._question.publish(Float64(data=y[0]))
+        echoed_s = self._time_until(lambda: self.echoed > echoed, asked, begin + period_s)
+        self._wait_until(begin + period_s)
+        for plant, v in zip(self._plants, self._v, strict=True):
+            plant.step(v)
+        return answered_s, echoed_s
+
+    def _time_until(self, condition: Callable[[], bool], asked: float, end: float) -> float:
+        while not condition():
+            left = end - time.perf_counter()
             if left <= 0.0:
                 return np.nan
-            self.spin(left)
-        return time.perf_counter() - begin
+            self.executor.serve_urgent(int(1e9 * left))
+        return time.perf_counter() - asked
+
+    def _wait_until(self, end: float) -> None:
+        while (left := end - time.perf_counter()) > 0.0:
+            self.executor.serve_urgent(int(1e9 * left))
 
 
 def measure(together: bool, law: str, rate: float, seconds: float) -> list[str]:
     """A row: start-up, processor time, memory, latency, commands that came too late."""
-    period_s, samples = 1.0 / rate, round(rate * seconds)
+    controllers = commands(together, law, 1.0 / rate)
+    echo = [sys.executable, str(Path(__file__).parent / 'real_time' / 'echo_node.py')]
     begin = time.perf_counter()
-    with processes(commands(together, law, period_s)) as (supervisor, domain):
-        waited = {child.name for child in supervisor.children}
+    with processes({**controllers, 'echo': echo}) as (supervisor, domain):
+        waited = set(controllers)
         while waited:
             wait_for_event(
                 supervisor, lambda kind, who: kind == 'ready' and waited.discard(who) is None
             )
         start_up = time.perf_counter() - begin
-        pids = [child.process.pid for child in supervisor.children]
-        with closing(Driver(domain, together)) as driver:
+        pids = [child.process.pid for child in supervisor.children if child.name != 'echo']
+        with closing(Driver(domain, together, rate)) as driver:
             if not driver.wait_for(driver.all_listen, MEETING_S):
                 raise RuntimeError(f'not all controllers listen within {MEETING_S:g} s')
-            latencies, used, first = [], 0.0, 0.0
-            next_s = time.perf_counter()
-            for k in range(samples):
-                if k == round(WARM_UP * samples):
-                    latencies, used, first = [], used_s(pids), time.perf_counter()
-                latencies.append(driver.sample(k * period_s, period_s))
-                next_s = max(next_s + period_s, time.perf_counter())
-                while (left := next_s - time.perf_counter()) > 0.0:
-                    driver.spin(left)
+            warm_up = round(rate * WARM_UP_S)
+            for k in range(warm_up):
+                driver.sample(k)
+            used, first = used_s(pids), time.perf_counter()
+            latencies, echoes = np.array([
+                driver.sample(warm_up + k) for k in range(round(rate * seconds))
+            ]).T
             share = (used_s(pids) - used) / (time.perf_counter() - first)
             memory_mb = sum(map(resident_mb, family(pids)))
         supervisor.stop()
-    p50, p99 = 1e3 * np.nanpercentile(latencies, (50, 99))
+    (p50, p99), (echo_p50, echo_p99) = (
+        1e3 * np.nanpercentile(each, (50, 99)) for each in (latencies, echoes))
     return [
         'six joints in one' if together else 'six controllers', f'{start_up:.1f}',
         f'{100.0 * share:.1f}', f'{memory_mb:.0f}', f'{p50:.2f}', f'{p99:.2f}',
+        f'{p50 / echo_p50:.2f}', f'{p99 / echo_p99:.2f}', f'{1e3 * np.nanmax(latencies):.1f}',
         f'{int(np.isnan(latencies).sum())} of {len(latencies)}',
     ]
 
@@ -153,7 +203,8 @@ def main() -> None:
     parser.add_argument('--rate', type=float, default=100.0, help='[Hz]')
     parser.add_argument('--seconds', type=float, default=20.0)
     options = parser.parse_args()
-    header = ('', 'ready [s]', 'processor [%]', 'memory [MB]', 'p50 [ms]', 'p99 [ms]', 'late')
+    header = ('', 'ready [s]', 'processor [%]', 'memory [MB]', 'p50 [ms]', 'p99 [ms]',
+              'p50 / echo', 'p99 / echo', 'max [ms]', 'late')
     print(text_table(header, [
         measure(together, options.law, options.rate, options.seconds) for together in (True, False)
     ]))
