@@ -22,6 +22,7 @@ from backlash_ros.nodes.runtime import messages
 from backlash_ros.nodes.runtime.executor import PromptExecutor
 from backlash_ros.nodes.runtime.parameters import let_parameters_change
 from backlash_ros.nodes.runtime.process import ProcessNode, emit, run
+from backlash_ros.nodes.runtime.wire import message_with
 
 
 class PlantTopics:
@@ -52,7 +53,7 @@ class PlantTopics:
         """Publish y of a sample, in lockstep after the simulated time."""
         if self._clock is not None:
             self._clock.publish(messages.clock_message(round(time_s * 1e9)))
-        self._output.publish(messages.message_with(y))
+        self._output.publish(message_with(y))
         self.outputs, self.newest = self.outputs + 1, sample
 
     def publish_truth(self) -> None:
@@ -180,7 +181,7 @@ class PlantNode(ProcessNode):
         u = plant.step(v)
         truth = plant.backlash
         self._published.truth_rows.append((u, truth.m, truth.c_r, truth.c_l, v, float(sample)))
-        self._published.applied.publish(messages.message_with(plant.applied))
+        self._published.applied.publish(message_with(plant.applied))
 
     def _publish_output(self, latest_ns: float = inf) -> bool:
         """Measure y, and publish it unless it is lost on purpose or too late."""

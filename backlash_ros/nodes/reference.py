@@ -25,6 +25,7 @@ from backlash_ros.nodes.runtime.driver_io import DriverIo
 from backlash_ros.nodes.runtime.executor import PromptExecutor, serve_polled
 from backlash_ros.nodes.runtime.parameters import let_parameters_change
 from backlash_ros.nodes.runtime.process import ProcessNode, emit, run
+from backlash_ros.nodes.runtime.wire import message_with
 
 
 class ReferenceNode(ProcessNode):
@@ -150,7 +151,7 @@ class ReferenceNode(ProcessNode):
         # The same product as in a simulation in one process, so that runs agree to the last bit.
         self._newest = sample
         y_m = self._signal(sample * self.settings.sample_period + self._offset_s)
-        self._output.publish(messages.message_with(y_m))
+        self._output.publish(message_with(y_m))
 
 
 main = partial(run, REFERENCE_NODE, ReferenceNode)

@@ -21,8 +21,15 @@ from backlash_ros.core.loop.sample_counter import Output
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.nodes.runtime.executor import serve_polled
-from backlash_ros.nodes.runtime.messages import DEPTH, message_with, number_of
+from backlash_ros.nodes.runtime.messages import DEPTH
 from backlash_ros.nodes.runtime.process import ProcessNode
+from backlash_ros.nodes.runtime.wire import (
+    JointMessage,
+    JointReader,
+    joint_message,
+    message_with,
+    number_of,
+)
 
 
 class DriverTopics(NamedTuple):
@@ -121,7 +128,7 @@ class DriverIo:
         self.simulated_time = bool(node.get_parameter('use_sim_time').value)
         self._node, self._p = node, p
         self._newest: dict[str, float] = {}  # v by joint
-        self._referred = JointState()  # the newest message of references
+        self._referred = JointMessage()  # the newest message of references
         self._heard: dict[str, Subscription] = {}  # by what they are about
 
     @property
@@ -155,46 +162,49 @@ class DriverIo:
                 info['received_timestamp'], info['publication_sequence_number'],
             )})
 
-        def hear_joints(message: JointState, info: dict[str, Any]) -> None:
+        reader = JointReader()
+
+        def hear_joints(content: bytes, info: dict[str, Any]) -> None:
+            message = reader.read(content)
             values = self.values(message)
-            for joint in self.joint_names:
-                self.skipped[joint] = 0 if joint in values else self.skipped[joint] + 1
             if len(values) < len(self.joint_names):
                 self.seen = ', '.join(message.name)
+                for joint in self.joint_names:
+                    self.skipped[joint] = 0 if joint in values else self.skipped[joint] + 1
+            elif any(self.skipped.values()):
+                self.skipped = dict.fromkeys(self.joint_names, 0)
             if not values:
                 return
-            stamp, number = message.header.stamp, info['publication_sequence_number']
+            number = info['publication_sequence_number']
             stamp_ns = self.stamps.told(
-                stamp.sec * 10**9 + stamp.nanosec, number,
-                lambda: self._node.count_publishers(self.topics.output),
+                message.stamp_ns, number, lambda: self._node.count_publishers(self.topics.output),
             )
             # Drivers that leave the header empty are known by the stamp of the middleware.
-            of_all = Output(
-                nan, stamp_ns or self.stamp_ns(info), info['source_timestamp'],
-                info['received_timestamp'], number, numbered=False,
+            of_all = (
+                stamp_ns or self.stamp_ns(info), info['source_timestamp'],
+                info['received_timestamp'], number, False,
             )
-            hear({joint: of_all._replace(y=y) for joint, y in values.items()})
+            hear({joint: Output(y, *of_all) for joint, y in values.items()})
 
         of_joints = self.topics.output_type is JointState
         return self._node.listen(
             self.topics.output_type, self.topics.output, hear_joints if of_joints else hear_number,
-            output_qos(self._p, depth), raw=not of_joints, polled=polled,
+            output_qos(self._p, depth), raw=True, polled=polled,
         )
 
     def listen_to_references(
         self, hear: Callable[[Mapping[str, float]], None], qos: QoSProfile | int, polled: bool,
     ) -> None:
         """Call hear with every y_m. polled: when serve_waiting is called."""
-        of_joints = self.topics.reference_type is JointState
+        of_joints, reader = self.topics.reference_type is JointState, JointReader()
 
-        def hear_values(message: bytes | JointState, info: dict[str, Any]) -> None:
+        def hear_values(content: bytes, info: dict[str, Any]) -> None:
             if of_joints:
-                self._referred = message
-            hear(self.values(message) if of_joints else {'': number_of(message)})
+                self._referred = reader.read(content)
+            hear(self.values(self._referred) if of_joints else {'': number_of(content)})
 
         self._heard['references'] = self._node.listen(
-            self.topics.reference_type, self.topics.reference, hear_values, qos, not of_joints,
-            polled,
+            self.topics.reference_type, self.topics.reference, hear_values, qos, True, polled,
         )
 
     @property
@@ -214,7 +224,9 @@ class DriverIo:
             lambda message: hear(self.values(message)), 1,
         )
 
-    def values(self, message: Float64 | Float64MultiArray | JointState) -> dict[str, float]:
+    def values(
+        self, message: Float64 | Float64MultiArray | JointState | JointMessage,
+    ) -> dict[str, float]:
         """What a message says about the joints of this node, by their names."""
         names = self.joint_names
         if isinstance(message, Float64):
@@ -237,41 +249,43 @@ class DriverIo:
 
     def publish(self, commands: Mapping[str, float]) -> None:
         """Send v, by joint, to the driver; an array as soon as there is a v of every joint."""
-        if self.topics.control_type is Float64:
-            # What rclpy would do after it has found out that these are bytes.
-            self.publisher.handle.publish_raw(message_with(commands['']))
-        elif self.topics.control_type is JointState:
-            self.publisher.publish(self._joint_state(commands))
-        else:
+        if self.topics.control_type is Float64MultiArray:
             self._newest.update(commands)
             if len(self._newest) == len(self.joint_names):
                 data = array('d', map(self._newest.__getitem__, self.joint_names))
                 self.publisher.publish(Float64MultiArray(data=data))
+            return
+        # What rclpy would do after it has found out that these are bytes.
+        self.publisher.handle.publish_raw(
+            message_with(commands['']) if self.topics.control_type is Float64
+            else joint_message(self._joint_state(commands)))
 
-    def _joint_state(self, commands: Mapping[str, float]) -> JointState:
+    def _joint_state(self, commands: Mapping[str, float]) -> JointMessage:
         """v, and what the newest reference says of the joints besides."""
-        names = [joint or self._p.io.joint for joint in commands]
-        message = JointState(name=names)
-        message.header.stamp = self._node.get_clock().now().to_msg()
-        row = {name: i for i, name in enumerate(self._referred.name)}
+        names = tuple(joint or self._p.io.joint for joint in commands)
+        row, fields = {name: i for i, name in enumerate(self._referred.name)}, {}
         for field in ('position', 'velocity', 'effort'):
             passed = getattr(self._referred, field)
             if field == self._p.io.field:
-                setattr(message, field, list(commands.values()))
+                fields[field] = tuple(commands.values())
             elif all(row.get(name, len(passed)) < len(passed) for name in names):
-                setattr(message, field, [passed[row[name]] for name in names])
-        return message
+                fields[field] = tuple(passed[row[name]] for name in names)
+        return JointMessage(self.now_ns(), names, **fields)
 
     def listen_to_reports(self, hear: Callable[[Mapping[str, float], int], None]) -> None:
         """Call hear with each v that the driver reports to have applied, and its stamp [ns].
 
         That is when serve_waiting is called.
         """
-        def hear_values(message: Float64 | JointState, info: dict[str, Any]) -> None:
-            hear(self.values(message), self.stamp_ns(info))
+        read, of_joints = JointReader().read, self.topics.applied_type is JointState
+
+        def hear_values(content: bytes, info: dict[str, Any]) -> None:
+            hear(self.values(read(content)) if of_joints else {'': number_of(content)},
+                 self.stamp_ns(info))
 
         self._heard['reports'] = self._node.listen(
-            self.topics.applied_type, self.topics.applied, hear_values, KEPT_COMMANDS, polled=True
+            self.topics.applied_type, self.topics.applied, hear_values, KEPT_COMMANDS, raw=True,
+            polled=True,
         )
 
     @property

@@ -1,11 +1,10 @@
-"""Messages that are made once and published often, or read without being made."""
+"""Messages that are made once and published often."""
 
 from __future__ import annotations
 
 import time
 from array import array
 from collections.abc import Mapping, Sequence
-from struct import Struct
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -17,21 +16,6 @@ from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 
 from backlash_ros import topics
 from backlash_ros.core.loop.finding import Finding, Level, LevelLog
-
-# std_msgs/Float64 as it goes over the wire: rclpy takes and publishes these bytes as they are, in
-# half the time of a message object. Four bytes name the encoding, the second one odd where the
-# lowest byte comes first, then comes the number (CDR: DDS Interoperability Wire Protocol, 10.2).
-CDR_FLOAT64 = Struct('<4sd')
-
-
-def number_of(message: bytes) -> float:
-    number: float = (CDR_FLOAT64 if message[1] & 1 else Struct('>4sd')).unpack_from(message)[1]
-    return number
-
-
-def message_with(number: float) -> bytes:
-    return CDR_FLOAT64.pack(b'\x00\x01\x00\x00', number)
-
 
 # Deep enough that a recorder which is held up for a second misses nothing.
 DEPTH = 1000

@@ -7,14 +7,22 @@ from typing import Any
 
 import pytest
 from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
 from backlash_ros.middleware.loopback import PROFILE, prefer_loopback
 from backlash_ros.nodes.control.publishing import watched_values
 from backlash_ros.nodes.control.rivals import ENDPOINT, SINCE, Rival, Rivals
-from backlash_ros.nodes.runtime.messages import SILENT_S, message_with, number_of
+from backlash_ros.nodes.runtime.messages import SILENT_S
 from backlash_ros.nodes.runtime.parameters import unused
+from backlash_ros.nodes.runtime.wire import (
+    JointMessage,
+    JointReader,
+    joint_message,
+    message_with,
+    number_of,
+)
 
 HERE = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
 
@@ -55,6 +63,32 @@ def test_what_is_no_number_stays_none() -> None:
 
 def test_a_sender_whose_highest_byte_comes_first_is_understood() -> None:
     assert number_of(b'\x00\x00\x00\x00' + struct.pack('>d', -7.25)) == -7.25
+
+
+JOINTS = (
+    JointMessage(5_000_000_006, ('a', 'wrist_1', 'elbow'), (1.0, inf, -2.5), (), (0.1, 0.2, 0.3)),
+    JointMessage(7, ('a', 'wrist_1', 'elbow'), (-1.0, 2.0), (3.0,)),
+    JointMessage(8, ('a', 'wrist_1', 'eight'), (4.0,)),
+    JointMessage(9, ('one',), (), (0.5,)),
+    JointMessage(10),
+)
+
+
+def test_joints_go_out_as_a_joint_state_and_come_in_as_one() -> None:
+    reader = JointReader()
+    for content in JOINTS:
+        state = deserialize_message(joint_message(content), JointState)
+        assert state.header.stamp.sec * 10**9 + state.header.stamp.nanosec == content.stamp_ns
+        for field in content._fields[1:]:
+            assert tuple(getattr(state, field)) == getattr(content, field)
+        for frame in ('', 'base', 'world'):
+            state.header.frame_id = frame
+            assert reader.read(serialize_message(state)) == content
+
+
+def test_joints_of_a_sender_whose_highest_byte_comes_first_are_understood() -> None:
+    message = struct.pack('>4siII2s2xII2s2xIdI', bytes(4), 1, 2, 2, b'f', 1, 2, b'j', 1, 0.5, 0)
+    assert JointReader().read(message + bytes(4)) == JointMessage(1_000_000_002, ('j',), (0.5,))
 
 
 @pytest.mark.parametrize(('sections', 'full_name'), [
