@@ -121,10 +121,9 @@ def test_joints_follow_through_silence_and_a_pulled_plug_and_are_limp_at_the_end
         await_log('waist is silent')
         arm.port = Port(arm.bus, arm.link)
         arm.probe.wait_until(lambda: arm.told([-0.3] * 6), 'all joints')
-        while len(arm.heard) < CYCLES:
-            before = len(arm.heard)
-            arm.array.publish(Float64MultiArray(data=[0.3 * math.sin(0.01 * before)] * 6))
-            arm.probe.wait_until(lambda: len(arm.heard) > before, 'the next cycle')
+        for cycle in range(len(arm.heard), CYCLES):
+            arm.array.publish(Float64MultiArray(data=[0.3 * math.sin(0.01 * cycle)] * 6))
+            arm.probe.wait_until(lambda end=cycle: len(arm.heard) > end, 'the next cycle')
         arm.probe.wait_until(lambda: arm.told([-0.3] * 6), 'all joints')
         log = arm.stop()
         found = re.search(r'(\d+) cycles, (\d+) of them lost; torque is off$', log, re.MULTILINE)

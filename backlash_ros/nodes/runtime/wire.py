@@ -13,20 +13,18 @@ from functools import lru_cache
 from struct import Struct, pack, unpack_from
 from typing import NamedTuple
 
-LITTLE_ENDIAN = b'\x00\x01\x00\x00'
-FLOAT64 = Struct('<4sd')
-STAMP = Struct('<4siI')
+CDR_FLOAT64 = Struct('<xBxxd')
 
 
 def number_of(message: bytes) -> float:
     """What a std_msgs/Float64 holds."""
-    number: float = (FLOAT64 if message[1] & 1 else Struct('>4sd')).unpack_from(message)[1]
+    number: float = (CDR_FLOAT64 if message[1] & 1 else Struct('>xBxxd')).unpack_from(message)[1]
     return number
 
 
 def message_with(number: float) -> bytes:
     """A std_msgs/Float64."""
-    return FLOAT64.pack(LITTLE_ENDIAN, number)
+    return CDR_FLOAT64.pack(1, number)
 
 
 class JointMessage(NamedTuple):
@@ -83,8 +81,7 @@ class JointReader:
 
 def joint_message(content: JointMessage) -> bytes:
     """A sensor_msgs/JointState without a frame."""
-    seconds, nanoseconds = divmod(content.stamp_ns, 10**9)
-    message = bytearray(STAMP.pack(LITTLE_ENDIAN, seconds, nanoseconds))
+    message = bytearray(pack('<xBxxiI', 1, *divmod(content.stamp_ns, 10**9)))
     message += _head_of(content.name)
     for values in content[2:]:
         message += bytes(-len(message) % 4) + len(values).to_bytes(4, 'little')
