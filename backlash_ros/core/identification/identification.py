@@ -22,6 +22,7 @@ from backlash_ros.core.identification.deviations import (
     least_response,
     response_of,
 )
+from backlash_ros.core.identification.rate_limit import limited, rate_limit
 from backlash_ros.core.identification.result import (
     Details,
     FoundModel,
@@ -71,7 +72,11 @@ def identify(
     options = options or Options()
     v, y = np.asarray(v, dtype=float), np.asarray(y, dtype=float)
     check_record(v, y)
-    given, part = Identification(sample_period, v, y), busiest(v, y)
+    part = busiest(v, y)
+    slow = rate_limit(v[part], y[part])
+    if slow is not None:
+        v = limited(v, slow)
+    given = Identification(sample_period, v, y)
     nothing = _why_nothing(v, y[part], options)
     if nothing:
         return replace(given, refused=nothing)
@@ -107,7 +112,13 @@ def identify(
     progress('judging')
     s = s._replace(samples=samples, best=best, held_out=s.held_out._replace(
         first=part.start + s.held_out.first))
-    return _as_a_gain(_described(s, given, options, units), s, given, options, units)
+    found = _as_a_gain(_described(s, given, options, units), s, given, options, units)
+    if slow is None or found.fit is None:
+        return found
+    details, verdict = found.fit
+    return replace(found, fit=(details, verdict._replace(remarks=(
+        f'v jumps, and the drive follows by at most {slow / sample_period:.4g} per s: the fit is '
+        'to v limited so, as is control.rate_max in the file', *verdict.remarks))))
 
 
 def _why_nothing(v: Array, y: Array, options: Options) -> str:
