@@ -108,7 +108,7 @@ def judge(f: Findings) -> Verdict:
     doubts = [*_doubts(f), *changes]
     spread = float(np.linalg.norm([doubt.deviation for doubt in doubts]))
     backlash = other if other is not None and not other.known else \
-        _backlash(f, max(doubts), spread)
+        _backlash(f, max(changes or doubts), spread)  # a change makes other orders fit as well
     remarks = [text for true, text in _remarks(f) if true]
     if backlash.known:
         remarks += [doubt.why for doubt in changes]
@@ -254,12 +254,13 @@ def _changes(f: Findings) -> Iterator[Doubt]:
         return
     family = LinearFamily(o.v, o.y)
     _, one = family.changing(f.gap, np.ones((1, len(o.v))))
-    for over, knots, what in ((np.arange(len(o.v)), 3, 'within the record'),
-                              (o.v, 5, 'with the place, from left to right')):
+    for over, knots, what, cure in (
+        (np.arange(len(o.v)), 3, 'within the record', 'take a part of it with --from and --to'),
+        (o.v, 5, 'with the place, from left to right', 'move v where it is one and the same'),
+    ):
         at = np.linspace(over.min(), over.max(), knots)
         hats = np.array([np.interp(over, at, row) for row in np.eye(knots)])
         gaps, other = family.changing(f.gap, hats)
         if np.ptp(gaps) > 0.1 * f.gap and family.explains(other, one, o.noise, 0.5):
             yield Doubt(float(np.sqrt(np.mean((gaps @ hats - f.gap) ** 2))),
-                        f'the gap changes {what}: ' + ', '.join(f'{gap:.3g}' for gap in gaps),
-                        'move v where it is one and the same')
+                        f'the gap changes {what}: ' + ', '.join(f'{gap:.3g}' for gap in gaps), cure)

@@ -115,6 +115,10 @@ def test_a_gap_that_changes_is_told_with_its_values_and_widens_the_deviation() -
     first, _, last = (float(word) for word in said.partition(': ')[2].split(', '))
     assert (first, last) == pytest.approx((0.55, 0.85), abs=0.03)  # the ends of a ramp
     assert found.gap_std > 0.07
+    # With orders that fit as well because of it, the change is what is to be known.
+    unsure = judge(FOUND._replace(observed=observed(V, behind(u, 'lag'), 0.7), apart=0.5))
+    assert not unsure.backlash.known
+    assert 'changes within the record' in unsure.backlash.reason
 
 
 @pytest.mark.parametrize(('changed', 'said'), [
