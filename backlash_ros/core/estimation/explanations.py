@@ -93,18 +93,18 @@ def problem_of(
 
 
 def afresh(
-    setup: Setup, record: Window, like: WindowFit | None = None, also: WindowFit | None = None,
-    walks: bool = False,
+    setup: Setup, record: Window, like: WindowFit | None = None, older: Prior | None = None,
+    also: WindowFit | None = None, walks: bool = False,
 ) -> WindowFit | None:
     """The best fit from nothing, mixed with other gaps that fit about as well; None for none.
 
-    like: G is that of this fit, as well as that knows it. also: where to begin as well. walks:
-    whether u may walk. A fit with m < 0 says that y goes the other way.
+    like: G is about that of this fit. older: what is known beside the record. also: where to begin
+    as well. walks: whether u may walk. A fit with m < 0 says that y goes the other way.
     """
     family, swing = setup.family, float(np.ptp(record.v))
     if np.isfinite(record.y).sum() < 15 + 2 * family.count or not swing:
         return None
-    p = problem_of(setup, record, None if like is None else of_xi(like))
+    p = problem_of(setup, record, older)
     # The noise of a first step is at least a twentieth of the motion of y.
     noise = max(setup.noise_std, 0.05 * float(np.nanstd(record.y)))
     xi = np.zeros(family.count) if like is None else like.theta[3:]

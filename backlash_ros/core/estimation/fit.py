@@ -311,8 +311,11 @@ class Problem:
             new, there, value = self._stepped(f, best, weights, most)
             if not value > best - 0.5:
                 # A kink where the play began bars the way to all else: held there, it does not.
-                other = self._stepped(f, best, weights, most, begun=True)
-                new, there, value = max((new, there, value), other, key=lambda one: one[2])
+                # The posterior stays that of a step that holds nothing.
+                _, begun, of_begun = self._stepped(f, best, weights, most, begun=True)
+                if of_begun > value:
+                    there = replace(begun, cov=new.cov, scale=new.scale, volume=new.volume)
+                    value = of_begun
             if not value > best - 50.0:  # f stands: only its posterior is new, and its noise
                 f = replace(f, cov=new.cov, scale=new.scale, volume=new.volume)
                 noise_std = f.noise_std if f.step else self._noise_of(f)

@@ -226,8 +226,8 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
         fit = with_intervals(problem, fit)
         if fit.spread.any():  # else it has been normal for long
             fit = replace(fit, spread=spread(problem, fit))
-        if count <= SHORT_RECORD and kept.older is None:
-            other = afresh(setup, record)
+        if count <= SHORT_RECORD and kept.start is None:
+            other = afresh(setup, record, None if kept.older is None else fit, kept.older)
             if other is not None and is_known(setup, other, settings.REVERSALS):
                 best = other if other.evidence > fit.evidence + 3.0 else fit
                 fit = replace(best, spread=spread(problem, best, [fit, other]))
@@ -301,7 +301,7 @@ def _doubted(setup: Setup, record: Window, before: Belief) -> Belief:
             whole = None
     for first in (since, (since + record.end) // 2):
         part = record.between(first)
-        found = afresh(setup, part, like=held) if len(part.v) >= PREDICTED else None
+        found = afresh(setup, part, held, of_xi(held)) if len(part.v) >= PREDICTED else None
         if found is None or found.left.rms > explained \
                 or not is_known(setup, found, found.left.turns + (setup.family.count > 0)):
             continue
