@@ -73,7 +73,7 @@ def write_outcome(
             found = replace(found, refused=f'the controller does not take it: {error}')
     write_summary({**numbers(found), 'timing': record.timing, 'notes': record.notes},
                   out / 'identified.json')
-    write_record(record, out / 'record.csv')
+    write_record(replace(record, v=found.v), out / 'record.csv')
     # A Ctrl-C waits while Matplotlib is loaded, which would take it for a part that is missing.
     signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT,))
     from backlash_ros.tools.identify.pictures import pictures
