@@ -112,7 +112,7 @@ def _fitted(setup: explanations.Setup, v: Array, y: Array, bounds: Bounds | None
         record = record._replace(y=np.where(wild, nan, record.y))
         problem = explanations.problem_of(setup, record)
         fit = explanations.afresh(setup, record, also=fit) or fit
-    reversals = turns(np.append(fit.p0, problem.input(fit)[0]), 5.0 * fit.gap_std)
+    reversals = turns(np.append(fit.p0, problem.at(fit).p), 5.0 * fit.gap_std)
     wanted = settings.REVERSALS if family.count else 1
     values, stds = (fit.crossings * [sign, 1.0, 1.0]).tolist(), fit.crossings_std.tolist()
     doubts = {

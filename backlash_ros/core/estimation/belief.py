@@ -116,8 +116,7 @@ class Belief:
 
     def problem(self, setup: Setup, record: Window) -> Problem:
         """The fit of a record beside what is believed of the samples before it."""
-        walk_std = self.fit.walk_std if self.fit is not None else 0.0
-        return problem_of(setup, record, self.kept.older, self.kept.start, walk_std)
+        return problem_of(setup, record, self.kept.older, self.kept.start)
 
 
 # --- what is published --------------------------------------------------------------------------
@@ -184,7 +183,7 @@ def excess(setup: Setup, record: Window, problem: Problem, fit: WindowFit) -> in
     drifts = count > 4 * settings.PREDICTED and (drift > np.diag(fit.crossings_cov)).any()
     if drifts or count >= settings.LONGEST:
         return count // 3
-    turns = reversals(engaged(record.v, problem.input(fit)[0], fit.gap))
+    turns = reversals(engaged(record.v, problem.at(fit).p, fit.gap))
     if count < settings.LIVELY or len(turns) <= settings.HELD_REVERSALS:
         return 0
     cut = min(count // 3, int(turns[-settings.HELD_REVERSALS]) - 1)
@@ -197,7 +196,7 @@ def shortened(setup: Setup, record: Window, belief: Belief, cut: int) -> Belief:
     assert fit is not None
     rest = record.between(record.first + cut)
     old = belief.problem(setup, record.between(record.first, rest.first))
-    p, _ = old.input(fit)
+    p = old.at(fit).p
     side, start = engaged(old.v, p, fit.gap)[-1], None
     if side != Region.GAP:
         left = bool(side == Region.LEFT)
@@ -205,7 +204,7 @@ def shortened(setup: Setup, record: Window, belief: Belief, cut: int) -> Belief:
     begin = replace(fit, p0=float(p[-1]), x=np.zeros(len(fit.x)), knots=np.zeros(0))
     older = _aged(setup, fit, old.remembered(replace(fit, knots=begin.knots)), cut)
     for beside in ((older, start), (None, None)):
-        problem = problem_of(setup, rest, *beside, walk_std=fit.walk_std)
+        problem = problem_of(setup, rest, *beside)
         shorter = problem.finished(problem.fitted(problem.begun(begin)))
         if shorter.left.rms < 2.0 * fit.left.rms:
             break

@@ -85,11 +85,9 @@ class Window(NamedTuple):
 
 def problem_of(
     setup: Setup, record: Window, older: Prior | None = None, start: Start | None = None,
-    walk_std: float = 0.0,
 ) -> Problem:
     """The fit of a record by this setup."""
-    return Problem(setup.family, record.v, record.y, setup.noise_std, older, start,
-                   max(walk_std, setup.walk_std))
+    return Problem(setup.family, record.v, record.y, setup.noise_std, older, start)
 
 
 def afresh(
@@ -125,13 +123,15 @@ def afresh(
                 gaps.append(gap)
                 theta = np.concatenate([[m, m * (p0 - record.v[0]), gap], xi])
                 start = p.step(
-                    WindowFit(np.zeros(1), p0, theta, noise), 1.0, held=True, begun=True)
+                    WindowFit(np.zeros(1), p0, theta, noise, walk_std=setup.walk_std), 1.0,
+                    held=True, begun=True)
                 fits.append(p.finished(p.fitted(start, FIRST_STEPS)))
         xi = max(fits, key=lambda f: f.evidence).theta[3:]
     if not fits:
         return None
     if also is not None and also.m > 0.0:
-        begins = replace(also.without_intervals, x=np.zeros(1))
+        begins = replace(also.without_intervals, x=np.zeros(1), knots=np.zeros(0),
+                         walk_std=setup.walk_std)
         fits.append(p.finished(p.fitted(begins, FIRST_STEPS)))
     fits = sorted((f for f in fits if np.isfinite(f.evidence)), key=lambda f: -f.evidence)
     different: list[WindowFit] = []
@@ -158,7 +158,7 @@ def with_intervals(p: Problem, f: WindowFit) -> WindowFit:
     """
     step, unknowns = p.step_of_readings, len(f.x) + len(f.knots) + 1 + len(f.theta)
     largest = 0.25 * step
-    edges = unknowns / max(float(p.weights(f).sum()), 1.0)
+    edges = unknowns / max(float(p.at(f).weights.sum()), 1.0)
     least = min(step * max(1.0 / 64.0, edges), largest)
     if not step or f.m <= 0.0 or (not f.step and f.noise_std > 0.75 * step):
         return p.finished(f)
@@ -188,16 +188,13 @@ def with_walk(setup: Setup, p: Problem, f: WindowFit) -> WindowFit:
     shares = (0.005, 0.02, 0.08)  # of m times the gap, by which u may walk over the record
     best, least = f, setup.walk_std
     begin = replace(f.without_intervals, knots=np.zeros(0), walk_std=least)
-    if f.walk_std > least:
-        still = p.walking(least)
-        best = with_intervals(still, still.fitted(begin))
+    if f.walk_std != least:
+        best = with_intervals(p, p.fitted(begin))
     if not best.valid or not best.systematic:
         return best
     for walk_std in (share * f.m * f.gap / sqrt(len(p.v)) for share in shares):
         if walk_std > least:
-            walking = p.walking(walk_std)
-            g = with_intervals(
-                walking, walking.fitted(replace(begin, walk_std=walk_std), FIRST_STEPS))
+            g = with_intervals(p, p.fitted(replace(begin, walk_std=walk_std), FIRST_STEPS))
             needed = 0.0 if best.walk_std > least else settings.FAR_BEHIND
             # Readings of which the walk leaves a correlated rest count as fewer.
             if g.valid and g.evidence - best.evidence > needed * g.inflation:
@@ -220,7 +217,7 @@ def spread(p: Problem, best: WindowFit, others: Sequence[WindowFit] = ()) -> Arr
         out += each * np.outer(apart, apart)
     if not best.valid or not best.gap > 0.0 or not best.cov[2, 2] > 0.0:
         return out
-    weights, std, v = p.weights(best), sqrt(best.cov[2, 2]), float(p.v[0])
+    weights, std, v = p.at(best).weights, sqrt(best.cov[2, 2]), float(p.v[0])
     likeliest, widest = p.log_posterior(best, weights), 2.0 * float(np.ptp(p.v))
     for away in (-3.0, 3.0):
         wider = np.zeros((3, 3))

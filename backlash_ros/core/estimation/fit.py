@@ -13,14 +13,14 @@ say is rows (R, d) on theta = (m, o, g, xi).
 
 from __future__ import annotations
 
-from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from math import inf, isfinite, log, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.plant_family import Family, padded, state_columns
+from backlash_ros.core.estimation.plant_family import Family, delayed, padded, sensitivities
 from backlash_ros.core.estimation.posterior import (
     Left,
     Likelihood,
@@ -40,9 +40,13 @@ Array = NDArray[np.float64]
 STEPS, FIRST_STEPS, FEW_STEPS = 16, 6, 3  # of Gauss-Newton, at most
 
 
-@dataclass
-class _Evaluated:
-    """What a record is by the values of a fit: G as b / a, p, u and y (N,), and what was asked."""
+@dataclass(frozen=True)
+class Run:
+    """A record by the values of a fit: G as b / a; p, u, y and what readings are off, all (N,).
+
+    error: 0 where y was lost. weights: how much of an independent reading each one is (N,).
+    begins: where each of these begins among those that are known.
+    """
 
     fit: WindowFit
     b: list[float]
@@ -50,93 +54,81 @@ class _Evaluated:
     p: Array
     u: Array
     y: Array
-    independent: tuple[Array, NDArray[np.intp]]
-    likelihoods: dict[tuple[float, float], Likelihood] = field(default_factory=dict)
+    error: Array
+    weights: Array
+    begins: NDArray[np.intp]
+
+    @cached_property
+    def likelihood(self) -> Likelihood:
+        """That of the readings."""
+        return likelihood(self.error, self.fit.noise_std, self.fit.step)
+
+    def is_of(self, f: WindowFit) -> bool:
+        """Whether these are the values of a fit, its noise left aside."""
+        return (f.x is self.fit.x and f.theta is self.fit.theta and f.knots is self.fit.knots
+                and f.p0 == self.fit.p0)
 
 
 class Problem:
     """A record v, y (N,), y nan where lost, with what is known beside it.
 
     noise_std: nominal, a weak prior. older: what samples before the record say. start: where the
-    play rests, None where unknown. walk_std: of u per square root of a sample, 0 for none. step: of
-    the readings, None to be told from them.
+    play rests, None where unknown. step: of the readings, None to be told from them.
     """
 
     def __init__(
         self, family: Family, v: Array, y: Array, noise_std: float,
-        older: Prior | None = None, start: Start | None = None, walk_std: float = 0.0,
-        step: float | None = None,
+        older: Prior | None = None, start: Start | None = None, step: float | None = None,
     ) -> None:
         self.family, self.v, self.nominal = family, v, noise_std
         self.older, self.start = older, start
         self.known = np.isfinite(y)
         self.y = np.where(self.known, y, 0.0)
         self.step_of_readings = step_of(y) if step is None else step
-        self._newest: list[_Evaluated] = []  # of which nothing is computed again
-        self._walk_by(walk_std)
-
-    def walking(self, walk_std: float) -> Problem:
-        """The same for another walk of u."""
-        other = copy(self)
-        other._walk_by(walk_std)
-        return other
-
-    def _walk_by(self, walk_std: float) -> None:
-        count, self.walk_std = len(self.v), walk_std
-        knots = min(max(count // 8, 1), 36) if walk_std else 0  # 8 samples apart, or more
-        at = np.linspace(0.0, count - 1.0, knots + 1)
-        self._hats = np.array([  # d by each of its knots, and to 0 at the end
-            np.interp(np.arange(count), at, row) for row in np.eye(knots, knots + 1)
-        ]).reshape(knots, count)
-
-    @property
-    def _knot_std(self) -> float:
-        return self.walk_std * sqrt(len(self.v) / max(len(self._hats), 1))
+        self._newest: list[Run] = []  # of which nothing is computed again
 
     # --- the model -----------------------------------------------------------------------------
 
-    def input(self, f: WindowFit) -> tuple[Array, Array]:
-        """p and u = m p - o + d over the record, both (N,)."""
-        evaluated = self._evaluated(f)
-        return evaluated.p, evaluated.u
-
-    def output(self, f: WindowFit) -> Array:
-        """y that is expected (N,)."""
-        return self._evaluated(f).y
-
-    def _evaluated(self, f: WindowFit) -> _Evaluated:
-        for one in self._newest:
-            if (f.x is one.fit.x and f.theta is one.fit.theta and f.knots is one.fit.knots
-                    and f.p0 == one.fit.p0):
-                return one
-        p = play(self.v, max(f.gap, 0.0), f.p0)
-        u = f.m * p - f.theta[1]
-        if len(f.knots):
-            at = np.linspace(0.0, len(self.v) - 1.0, len(f.knots) + 1)
-            u += np.interp(np.arange(len(self.v)), at, np.append(f.knots, 0.0))
-        b, a = self.family.at(f.xi)
-        y = lfilter(b, a, u, padded(f.x, len(a) - 1))
-        independent = independence(self.y, self.known, y, self.step_of_readings)
-        one = _Evaluated(f, b, a, p, u, y, independent)
-        self._newest = [one, *self._newest[:2]]
-        return one
+    def at(self, f: WindowFit) -> Run:
+        """The record by the values of this fit."""
+        run = next((run for run in self._newest if run.is_of(f)), None)
+        if run is None:
+            p = play(self.v, max(f.gap, 0.0), f.p0)
+            u = f.m * p - f.theta[1] + self._knots(f) @ self._hats(f)
+            b, a = self.family.at(f.xi)
+            y = lfilter(b, a, u, padded(f.x, len(a) - 1))
+            run = Run(f, b, a, p, u, y, (self.y - y) * self.known,
+                      *independence(self.y, self.known, y, self.step_of_readings))
+        elif (f.noise_std, f.step) != (run.fit.noise_std, run.fit.step):
+            run = replace(run, fit=f)
+        else:
+            return run
+        self._newest = [run, *self._newest[:2]]
+        return run
 
     def residual(self, f: WindowFit) -> Array:
         """y minus what is expected (N,), nan where it was lost."""
-        return np.where(self.known, self.y - self.output(f), np.nan)
+        return np.where(self.known, self.at(f).error, np.nan)
 
-    def weights(self, f: WindowFit) -> Array:
-        """How much of an independent reading each one is where y is as f has it (N,)."""
-        return self._evaluated(f).independent[0]
+    @cached_property
+    def _walk(self) -> Array:
+        """d by each of its knots, 8 samples apart or more, and to 0 at the end (W, N)."""
+        count = len(self.v)
+        knots = min(max(count // 8, 1), 36)
+        place = np.arange(count) * knots / max(count - 1, 1)
+        return np.asarray(np.maximum(1.0 - np.abs(place - np.arange(knots)[:, None]), 0.0))
 
-    def _likelihood(self, f: WindowFit) -> Likelihood:
-        one, how = self._evaluated(f), (f.noise_std, f.step)
-        if how not in one.likelihoods:
-            found = likelihood(self.y - one.y, *how)
-            # In such units that a reading more or less makes no fit the likelier one.
-            density = found.log_density + log(self.step_of_readings or self.nominal)
-            one.likelihoods[how] = found._replace(log_density=density)
-        return one.likelihoods[how]
+    def _hats(self, f: WindowFit) -> Array:
+        """The same, or none where u does not walk."""
+        return self._walk if f.walk_std else np.zeros((0, len(self.v)))
+
+    def _knots(self, f: WindowFit) -> Array:
+        count = len(self._hats(f))
+        return f.knots if len(f.knots) == count else np.zeros(count)
+
+    def _knot_std(self, f: WindowFit) -> float:
+        """Standard deviation of what d moves by from one knot to the next."""
+        return f.walk_std * sqrt(len(self.v) / len(self._walk))
 
     def log_posterior(self, f: WindowFit, w: Array | None = None) -> float:
         """Of these values but for constants; -inf where it is no number.
@@ -144,17 +136,16 @@ class Problem:
         w: weights of the readings (N,), the same for all that are compared; None: those of f.
         """
         with np.errstate(all='ignore'):
-            w = self.weights(f) if w is None else w
+            run = self.at(f)
+            w = run.weights if w is None else w
+            value = f.log_prior(self.older, self.family.leaks)
             if f.step:
-                value = float((self._likelihood(f).log_density * w)[self.known].sum())
+                value += float(w @ run.likelihood.log_density)
             else:
-                r = self.y - self.output(f)
-                squares, count = float((w * r) @ r), float(w.sum()) + 1.0
-                value = -0.5 * count * log((squares + self.nominal**2) / count) \
-                    if isfinite(squares) else -inf
-            value += f.log_prior(self.older, self.family.leaks)
-            if len(self._hats):
-                moves = np.diff(self._knots_of(f), append=0.0) / self._knot_std
+                squares, count = float((w * run.error) @ run.error), float(w.sum()) + 1.0
+                value -= 0.5 * count * log((squares + self.nominal**2) / count)
+            if f.walk_std:
+                moves = np.diff(self._knots(f), append=0.0) / self._knot_std(f)
                 value -= 0.5 * float(moves @ moves)
         return value if isfinite(value) else -inf
 
@@ -170,132 +161,99 @@ class Problem:
         """
         from scipy.linalg.lapack import dtrtri  # where fits are made: 31 MB
 
-        r, order = self._triangle(f, held, begun), len(self._evaluated(f).a) - 1
-        size = r.shape[1] - 1
-        k = self.family.count - self.family.leaks
-        n, at = size - k, size - self.family.count - 3  # a leak is one of the first; place of m
-        diagonal = np.abs(np.diag(r))[:n]
+        r, run = self._triangle(f, held, begun), self.at(f)
         if not np.isfinite(r).all():
             raise np.linalg.LinAlgError('the samples leave no finite posterior')
-        inverse = dtrtri(r[:n, :n])[0] if diagonal.min() > 0.0 else np.linalg.pinv(r[:n, :n])
-        by = inverse @ r[:n, n:]
-        freedom = max(float(self.weights(f).sum()) - n, 0.0) + 1.0
+        # eta, all but the error of G, is R11^-1 (d1 - R12 xi) + R11^-1 noise.
+        size, k = len(r) - 1, self.family.count - self.family.leaks  # a leak is one of the first
+        n, order, at = size - k, len(run.a) - 1, size - self.family.count - 3  # at: place of m
+        diagonal = np.abs(np.diag(r))[:n]
+        of_eta, of_xi = np.zeros((size, n)), np.eye(size, k, -n)
+        of_eta[:n] = dtrtri(r[:n, :n])[0] if diagonal.min() > 0.0 else np.linalg.pinv(r[:n, :n])
+        of_xi[:n] = -of_eta[:n] @ r[:n, n:-1]
+        freedom = max(float(run.weights.sum()) - n, 0.0) + 1.0
         squares = float(r[size, size]) ** 2 + (self.nominal / f.noise_std) ** 2
         xi, cov_xi, scale, volume, noise = error_of_plant(
             f, r[n:, n:], squares, freedom, most_scale)
-        cov = np.empty((size, size))
-        cov[:n, :n] = noise * inverse @ inverse.T + by[:, :-1] @ cov_xi @ by[:, :-1].T
-        cov[:n, n:] = -by[:, :-1] @ cov_xi
-        cov[n:, :n], cov[n:, n:] = cov[:n, n:].T, cov_xi
-        beta = np.concatenate([by[:, -1] - by[:, :-1] @ xi, xi])
+        beta = of_eta @ r[:n, -1] + of_xi @ xi
+        cov = noise * of_eta @ of_eta.T + of_xi @ cov_xi @ of_xi.T
         volume -= float(np.log(np.maximum(diagonal, 1e-300)).sum())
-        if len(self._hats):
-            volume -= len(self._hats) * log(self._knot_std)
+        if f.walk_std:
+            volume -= len(self._walk) * log(self._knot_std(f))
         return replace(
-            f, x=beta[:order], knots=beta[order:at - 1], walk_std=self.walk_std,
-            p0=float(beta[at - 1]), theta=beta[at:], scale=scale, cov=cov[at:, at:], volume=volume,
+            f, x=beta[:order], knots=beta[order:at - 1], p0=float(beta[at - 1]), theta=beta[at:],
+            scale=scale, cov=cov[at:, at:], volume=volume,
         )
 
     def remembered(self, f: WindowFit) -> Prior:
         """What the record and what is known beside it say of theta, but for the prior of xi."""
         r = self._triangle(f, False, False)
-        at = r.shape[1] - 4 - self.family.count
+        at = len(r) - 4 - self.family.count
         return Prior(r[at:-1, at:-1], r[at:-1, -1])
 
     def _triangle(self, f: WindowFit, held: bool, begun: bool) -> Array:
         """R of the rows of a step, (P + 1, P + 1)."""
         from scipy.linalg.lapack import dgeqrf  # as above
 
-        stack = self.rows(f, held, begun)
-        scale = np.maximum(np.sqrt(np.einsum('ij,ij->j', stack, stack)), 1e-300)
-        scale[-1] = 1.0
-        stack /= scale
-        return np.asarray(np.triu(dgeqrf(stack, overwrite_a=1)[0][:len(scale)]) * scale)
+        rows = self.rows(f, held, begun)
+        return np.asarray(np.triu(dgeqrf(rows, overwrite_a=1)[0][:rows.shape[1]]))
 
     def rows(self, f: WindowFit, held: bool = False, begun: bool = False) -> Array:
         """The least squares of a step: a row for each sample, then those beside, the target last.
 
         Readings have deviation 1 in it, shape (N + B, P + 1). held, begun: as above.
         """
-        _, score, information = self._likelihood(f)
-        x = padded(f.x, len(self._evaluated(f).a) - 1)
-        beta = np.concatenate([x, self._knots_of(f), [f.p0], f.theta])
-        beside = self._beside(f, len(x), len(beta), held, begun)
-        count = len(self.v)
-        stack = np.empty((count + len(beside), len(beta) + 1), order='F')
-        rows, stack[count:] = stack[:count], beside
-        jacobian = self.jacobian(f, rows[:, :-1])
-        rows[:, -1] = jacobian @ beta + score / information
-        rows *= np.sqrt(information * self.weights(f))[:, None]
-        return stack
+        run, jacobian = self.at(f), self.jacobian(f)
+        _, score, information = run.likelihood
+        x = padded(f.x, len(run.a) - 1)
+        beta = np.concatenate([x, self._knots(f), [f.p0], f.theta])
+        of_samples = np.vstack([jacobian.T, jacobian @ beta + score / information])
+        of_samples *= np.sqrt(information * run.weights)
+        return np.hstack([of_samples, self._beside(f, len(x), held, begun).T]).T
 
     def normalised(self, f: WindowFit) -> Array:
         """Residuals of deviation 1, or what stands for them with intervals (N,); 0 where lost."""
-        _, score, information = self._likelihood(f)
-        return np.asarray(score * np.sqrt(self.weights(f) / information))
+        _, score, information = self.at(f).likelihood
+        return np.asarray(score * np.sqrt(self.at(f).weights / information))
 
-    def _knots_of(self, f: WindowFit) -> Array:
-        return f.knots if len(f.knots) == len(self._hats) else np.zeros(len(self._hats))
-
-    def jacobian(self, f: WindowFit, out: Array | None = None) -> Array:
-        """Derivatives of y by X, knots, p0, m, o, g, xi: (N, P); out: where they are written."""
-        one = self._evaluated(f)
-        b, a = one.b, one.a
-        side = engaged(self.v, one.p, max(f.gap, 0.0))
+    def jacobian(self, f: WindowFit) -> Array:
+        """Derivatives of y by X, knots, p0, m, o, g, xi: (N, P)."""
+        run, count = self.at(f), len(self.v)
+        side = engaged(self.v, run.p, max(f.gap, 0.0))
         # A side that has not moved p yet leaves it where it began.
-        side[:int(np.argmax(np.append(one.p != f.p0, True)))] = Region.GAP
-        count, order, walks = len(self.v), len(a) - 1, len(self._hats)
-        at = order + walks + 4
-        if out is None:
-            out = np.empty((count, at + self.family.count), order='F')
-        columns = np.zeros((walks + 7, count))
-        columns[0], columns[1], columns[2] = side == Region.GAP, one.p, -1.0
-        columns[3], columns[4:-3] = side == Region.LEFT, self._hats
-        columns[[0, 3]] *= f.m
-        columns[-3], columns[-2], columns[-1, 0] = one.u, -one.y, 1.0
-        once = lfilter([1.0], a, columns)
-        for i in range(order):
-            out[:i, i], out[i:, i] = 0.0, once[-1, :count - i]
-        forced = lfilter(b, [1.0], once[:-3])
-        out[:, order:order + walks], out[:, order + walks:at] = forced[4:].T, forced[:4].T
-        if self.family.count:
-            slopes = np.stack(self.family.slopes(f.xi), axis=1)
-            late = np.zeros((*slopes.shape[1:], count))  # u / A and -y / A, so many samples later
-            for i in range(late.shape[1]):
-                late[:, i, i:] = once[-3:-1, :count - i]
-            out[:, at:] = np.tensordot(late, slopes, ((0, 1), (1, 2)))
-        return out
+        side[:int(np.argmax(np.append(run.p != f.p0, True)))] = Region.GAP
+        over_a = lfilter([1.0], run.a, np.vstack([
+            self._hats(f), f.m * (side == Region.GAP), run.p, np.full(count, -1.0),
+            f.m * (side == Region.LEFT), run.u, run.y, np.eye(1, count)]))
+        *_, u, y, impulse = over_a
+        return np.vstack([
+            delayed(impulse, len(run.a) - 1), lfilter(run.b, [1.0], over_a[:-3]),
+            sensitivities(self.family, f.xi, u, y)]).T
 
-    def _beside(self, f: WindowFit, order: int, size: int, held: bool, begun: bool) -> Array:
+    def _beside(self, f: WindowFit, order: int, held: bool, begun: bool) -> Array:
         """Rows (B, P + 1) of what is known beside the samples, the target in the last column."""
         vague = 100.0  # prior deviation of the state before a record, over the largest reading
         tight = 1e6  # weight of what is held
-        walks, leaks, older = len(self._hats), self.family.leaks, self.older
-        first, rows = size - 3 - self.family.count, 0 if older is None else len(older.rows)  # of m
-        out = np.zeros((rows + 2 + leaks + order + walks, size + 1))
+        walks, leaks, older, first = len(self._hats(f)), self.family.leaks, self.older, self.v[0]
+        at = order + walks + 1  # place of m
+        *unit, target = np.eye(at + 4 + self.family.count)
+        p0, gap = unit[at - 1], unit[at + 2]
+        begin = tight * (p0 - self.start.left * gap + self.start.v * target) if self.start \
+            else sqrt(12.0) / max(f.gap, 1e-9) * (p0 + (first + 0.5 * f.gap) * target)
+        rows = [
+            # The gap is within the swing; p0 is anywhere within the gap of now.
+            tight * (gap + f.gap * target) if held else gap / max(float(np.ptp(self.v)), 1e-300),
+            tight * (p0 + f.p0 * target) if begun else begin,
+            *unit[at + 3:at + 3 + leaks],
+            # What no reading tells, as where the first were lost, would grow without bounds.
+            *(x / (vague * max(float(np.abs(self.y).max()), 1e-300)) for x in unit[:order]),
+            *((unit[k] - (k + 1 < order + walks) * unit[k + 1]) / self._knot_std(f)
+              for k in range(order, order + walks)),
+        ]
         if older is not None:
-            out[:rows, first:-1], out[:rows, -1] = older.rows, older.values
-        of_gap, begin = out[rows], out[rows + 1]
-        of_gap[first + 2] = 1.0 / max(float(np.ptp(self.v)), 1e-300)  # the gap is within the swing
-        if held:
-            of_gap[first + 2], of_gap[-1] = tight, tight * f.gap
-        begin[first - 1] = tight
-        if begun:
-            begin[-1] = tight * f.p0
-        elif self.start is None:  # anywhere within the gap of now
-            begin[first - 1] = sqrt(12.0) / max(f.gap, 1e-9)
-            begin[-1] = (self.v[0] + 0.5 * f.gap) * begin[first - 1]
-        else:
-            begin[first + 2], begin[-1] = -tight * self.start.left, tight * self.start.v
-        rows += 2
-        out[rows:rows + leaks] = np.eye(leaks, size + 1, first + 3)
-        # What no reading tells, as where the first ones were lost, would grow without bounds.
-        state = 1.0 / (vague * max(float(np.abs(self.y).max()), 1e-300))
-        out[rows + leaks:rows + leaks + order] = state * np.eye(order, size + 1)
-        if walks:
-            between = (np.eye(walks) - np.eye(walks, k=1)) / self._knot_std
-            out[-walks:, first - 1 - walks:first - 1] = between
-        return out
+            before = np.zeros((len(older.rows), at))
+            rows.extend(np.column_stack([before, older.rows, older.values]))
+        return np.array(rows)
 
     # --- the fit --------------------------------------------------------------------------------
 
@@ -304,7 +262,7 @@ class Problem:
         least_move = 0.02  # deviations of the gap that a step may still move it by at the end
         far_steps = 4  # the first of them, over which G is no further off than configured
         for k in range(steps):
-            weights = self.weights(f)
+            weights = self.at(f).weights
             best = self.log_posterior(f, weights)
             # Far from the optimum the error of the linearization passes for one of G.
             most = 1.0 if k < far_steps < steps else np.inf
@@ -360,52 +318,45 @@ class Problem:
         return replace(f, theta=theta, p0=p0)
 
     def _noise_of(self, f: WindowFit) -> float:
-        r = np.where(self.known, self.y - self.output(f), 0.0)
-        w = self.weights(f)
-        free = max(float(w.sum()) - len(f.x) - len(f.knots) - 4.0, 0.0)
-        return sqrt((float((w * r) @ r) + self.nominal**2) / (free + 1.0))
+        run = self.at(f)
+        free = max(float(run.weights.sum()) - len(f.x) - len(f.knots) - 4.0, 0.0)
+        squares = float((run.weights * run.error) @ run.error)
+        return sqrt((squares + self.nominal**2) / (free + 1.0))
 
     def finished(self, f: WindowFit) -> WindowFit:
         """The same with what it leaves."""
-        known, evaluated = self.known, self._evaluated(f)
-        r = np.where(known, self.y - evaluated.y, 0.0)
-        w, begins = evaluated.independent
-        log_density, score, information = self._likelihood(f)
-        count = float(len(begins))
-        whole = score / sqrt(float(information[known].mean())) if f.step else r / f.noise_std
-        e = np.add.reduceat((whole * w)[known], begins)  # of what counts as one reading
+        run, known = self.at(f), self.known
+        w, count = run.weights, float(len(run.begins))
+        density, score, information = run.likelihood
+        whole = score * w / sqrt(float(information[known].mean()))
+        e = np.add.reduceat(whole[known], run.begins)  # of what counts as one reading
         squares = max(float(e @ e), 1e-300)
         rho = max(float(e[lag:] @ e[:-lag]) / squares for lag in (1, 2, 4, 8) if lag < len(e))
         rho = max(0.0, rho - 3.0 / sqrt(max(count, 1.0)))
         rho *= min(1.0, squares / max(count, 1.0))  # below the noise there may be anything
-        turns = reversals(engaged(self.v, evaluated.p, max(f.gap, 0.0)))
-        return replace(f, left=Left(
-            float((log_density * w)[known].sum()), sqrt(float(r @ r) / max(int(known.sum()), 1)),
-            rho, count, len(turns),
-        ))
-
-    def explained(self, f: WindowFit) -> Array:
-        """y that is expected (N,) with the state before the record and the offset at their best."""
-        return self.output(self.begun(f, True))
+        # In such units that a reading more or less makes no fit the likelier one.
+        value = float(w @ density) + float(w.sum()) * log(self.step_of_readings or self.nominal)
+        turns = len(reversals(engaged(self.v, run.p, max(f.gap, 0.0))))
+        rms = sqrt(float(run.error @ run.error) / max(int(known.sum()), 1))
+        return replace(f, left=Left(value, rms, rho, count, turns))
 
     def begun(self, f: WindowFit, offset: bool = False) -> WindowFit:
         """The same with the state before the record, and o if that is asked, at their best."""
-        there = self._evaluated(replace(f, x=np.zeros(1)))
-        columns = state_columns(there.a, len(self.v))
-        if offset:
-            of_o = lfilter(there.b, there.a, np.full(len(self.v), -1.0))
-            columns = np.column_stack([columns, of_o])
-        columns = columns[self.known]
-        best = np.linalg.lstsq(columns, (self.y - there.y)[self.known], rcond=1e-12)[0]
-        theta = f.theta + np.eye(len(f.theta))[1] * (best[-1] if offset else 0.0)
-        return replace(f, x=best[:len(there.a) - 1], theta=theta)
+        there = replace(f, x=np.zeros(1))
+        run, of_o = self.at(there), -2 - self.family.count
+        unknown = [*range(len(run.a) - 1), *[of_o] * offset]
+        columns = self.jacobian(there)[self.known][:, unknown]
+        best = np.linalg.lstsq(columns, run.error[self.known], rcond=1e-12)[0]
+        theta = f.theta.copy()
+        theta[1] += best[-1] * offset
+        return replace(f, x=best[:len(run.a) - 1], theta=theta)
 
 
 def _towards(f: WindowFit, new: WindowFit, share: float = 1.0) -> WindowFit:
     """The values this share of the way from f to new, with the posterior of new."""
     longest = 2.0  # prior deviations by which G moves at once
     furthest = float(np.abs(new.theta[3:] - f.theta[3:]).max(initial=0.0))
-    length = share * (min(longest / furthest, 1.0) if furthest else 1.0)
+    length = share * min(longest / max(furthest, longest), 1.0)
     order = max(len(f.x), len(new.x))
     old, x = padded(f.x, order), padded(new.x, order)
     knots = f.knots if len(f.knots) == len(new.knots) else np.zeros(len(new.knots))

@@ -168,7 +168,7 @@ def place_of(fit: WindowFit, problem: Problem, model: TransferFunction, memory: 
 
     memory: of G [samples].
     """
-    p, u = problem.input(fit)
+    p, u = problem.at(fit).p, problem.at(fit).u
     newest = slice(-min(len(p), 4 * memory, ROWS), None)
     u, y = u[newest], np.where(problem.known, problem.y, nan)[newest]
     return Place(float(p[-1]), u, y, state_after(model, u, y), model, gains_of(model))

@@ -21,6 +21,7 @@ from math import copysign, floor, inf
 from typing import Protocol
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from backlash_ros.core.plant.model_check import ON_CIRCLE
@@ -175,16 +176,28 @@ class PlantFamily:
 
 def padded(x: Array, length: int) -> Array:
     """The first values of x, and zeros behind them, (length,)."""
-    return np.pad(x[:length], (0, max(length - len(x), 0)))
+    out = np.zeros(length)
+    out[:len(x)] = x[:length]
+    return out
+
+
+def delayed(x: Array, count: int) -> Array:
+    """x (..., N) by 0, 1, ... samples later, zeros before it, shape (..., count, N)."""
+    behind = np.concatenate([np.zeros((*x.shape[:-1], count)), x], axis=-1)
+    return sliding_window_view(behind, x.shape[-1], axis=-1)[..., :0:-1, :]
 
 
 def state_columns(a: list[float], count: int) -> Array:
     """How outputs depend on the state before them, shape (count, order)."""
-    once = lfilter([1.0], a, np.eye(1, count)[0])
-    out = np.zeros((count, len(a) - 1))
-    for i in range(len(a) - 1):
-        out[i:, i] = once[:count - i]
-    return out
+    return delayed(lfilter([1.0], a, np.eye(1, count)[0]), len(a) - 1).T
+
+
+def sensitivities(family: Family, xi: list[float], u: Array, y: Array) -> Array:
+    """Derivatives of the output by each xi, (..., K, N); u, y: over A, input and output (..., N).
+    """
+    of_b, of_a = family.slopes(xi)
+    length = of_b.shape[1]
+    return np.asarray(of_b @ delayed(u, length) - of_a @ delayed(y, length))
 
 
 def _sections(poles: NDArray[np.complex128]) -> tuple[int, list[float]]:

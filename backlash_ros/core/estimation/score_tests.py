@@ -47,7 +47,7 @@ def coasts(problem: Problem, fit: WindowFit, known: Array | None = None) -> bool
             fit, theta=theta, p0=float(problem.v[0]) + 0.5 * (c_r - c_l)))
         if coasts(problem, problem.finished(there)):
             return True
-    v, p = problem.v, problem.input(fit)[0]
+    v, p = problem.v, problem.at(fit).p
     beyond = [0.0]  # how far a load that nothing brakes is from p
     speed = 0.0
     for k, move in enumerate(np.diff(p).tolist(), 1):
@@ -85,7 +85,7 @@ def likelier(problem: Problem, fit: WindowFit, record: Window, since: int, back:
     reach = memory_of(float(modes[modes < 1.0 - ON_CIRCLE].max(initial=0.0)))
     known = problem.known.astype(np.float64)
     q = _basis(problem.jacobian(fit) * known[:, None])
-    residual = (problem.y - problem.output(fit)) * known
+    residual = problem.at(fit).error
     # Correlated residuals are for the most part made by the commands that are looked for.
     noise = fit.noise * (own_noise if fit.systematic else 1.0)
     noise = max(noise, problem.nominal, problem.step_of_readings / sqrt(12.0))

@@ -250,7 +250,7 @@ def _contradicts(
 
     They do as well where it takes them in at the cost of all others. rho: correlation of residuals.
     """
-    weights = problem.weights(fit)
+    weights = problem.at(fit).weights
     z = problem.residual(fit) / held.noise
     if float(np.nanmean(z**2)) > _most(settings.AS_GOOD**2, float(weights.sum()), rho):
         return True

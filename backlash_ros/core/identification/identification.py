@@ -259,8 +259,8 @@ def _still(best: Model) -> float:
     problem, fit = best.problem, best.fit
     theta = fit.theta.copy()
     theta[2] = 2.0 * float(np.ptp(problem.v))
-    y = problem.explained(replace(fit, p0=float(problem.v.max()), theta=theta))
-    return max(float(np.sum((problem.y - y)[problem.known] ** 2)), TINY)
+    still = problem.begun(replace(fit, p0=float(problem.v.max()), theta=theta), True)
+    return max(float(np.sum(problem.at(still).error ** 2)), TINY)
 
 
 def _as_parameter(spread: float) -> float:

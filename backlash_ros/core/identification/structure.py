@@ -163,7 +163,7 @@ class Model:
     @cached_property
     def simulated(self) -> Array:
         """y of the model at every sample (M,)."""
-        return self.problem.output(self.fit)
+        return self.problem.at(self.fit).y
 
     @cached_property
     def residual(self) -> Array:
@@ -194,7 +194,7 @@ class Model:
     @cached_property
     def p(self) -> Array:
         """Play output as it acts on each y (M,)."""
-        return self.problem.input(self.fit)[0]
+        return self.problem.at(self.fit).p
 
     @property
     def numerator(self) -> Array:

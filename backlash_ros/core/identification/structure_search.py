@@ -348,7 +348,8 @@ def equal_delays(compared: Sequence[Compared], chosen: Compared) -> list[int]:
 def predicted(found: Model, later: Samples) -> Array:
     """Simulation over samples (M,), begun in the state and with the offset that fit them best."""
     begin = replace(found.fit, x=np.zeros(1), p0=float(found.p[-1]))
-    return later.problem(found.structure).explained(begin)
+    problem = later.problem(found.structure)
+    return problem.at(problem.begun(begin, True)).y
 
 
 def later(early: StructureSearch, options: Options, progress: Progress) -> StructureSearch:
