@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from math import copysign
 from typing import NamedTuple
 
 import numpy as np
@@ -73,6 +74,7 @@ class LinearFamily:
 
     def best(
         self, nonlinearity: Callable[..., Array], starts: Sequence[tuple[float, ...]],
+        evaluations: int = 50,
     ) -> Candidate:
         """The best parameters of a nonlinearity of v, from the best two starts."""
         from scipy.optimize import minimize  # a fifth of the time that a start takes
@@ -84,7 +86,7 @@ class LinearFamily:
         found = sorted((left(at), at) for at in starts)[:2]
         for _, at in list(found):
             result = minimize(left, at, method='Nelder-Mead',
-                              options={'maxfev': 50, 'xatol': 1e-4})
+                              options={'maxfev': evaluations, 'xatol': 1e-4})
             found.append((float(result.fun), tuple(result.x.tolist())))
         squares, at = min(found)
         return Candidate(squares, at, self.columns(nonlinearity(self.v, *at)))
@@ -115,18 +117,17 @@ class LinearFamily:
             widths = widths + self.solved(np.column_stack([*moved, columns]))[1][:len(basis)]
         return self.swing * np.maximum(best[0], 0.0), best[1]
 
-    def explains(self, other: Candidate, one: Candidate, noise: float,
-                 share: float = EXPLAINED) -> bool:
-        """Whether `other` explains this share of what `one` leaves over beyond the noise."""
+    def share(self, other: Candidate, one: Candidate, noise: float) -> float:
+        """Of what `one` leaves beyond the noise, what `other` explains; 0 where that is chance."""
         beyond = max(one.squares - noise**2 * len(self.rows), 1e-300)
         # Neighbours of smooth residuals tell little of their own.
         gain = 0.2 * len(self.rows) * np.log(one.squares / max(other.squares, 1e-300))
-        return bool(gain >= 15.0 and one.squares - other.squares >= share * beyond)
+        return (one.squares - other.squares) / beyond if gain >= 15.0 else 0.0
 
     def beats(self, other: Candidate, one: Candidate, noise: float) -> bool:
         """The same in both halves: what happens to fit one part does not fit the other."""
         half = len(self.rows) // 2
-        return self.explains(other, one, noise) and all(
+        return self.share(other, one, noise) >= EXPLAINED and all(
             self.solved(other.columns, part)[0]
             < (1.0 - 0.5 * EXPLAINED) * self.solved(one.columns, part)[0]
             for part in (slice(0, half), slice(half, None))
@@ -180,6 +181,15 @@ class Observed:
         widths = (6e-4, 3e-3, 0.01, 0.03, 0.1, 0.2, 0.4, 0.6, 0.8, self.gap / self.family.swing)
         return self.family.best(centred, [(width,) for width in widths])
 
+    @cached_property
+    def coasting(self) -> Candidate:
+        """The best play with a load that coasts within it."""
+        assert self.family is not None
+        best = self.one_play.at[0]
+        return self.family.best(coasting, [
+            (width, *brakes) for width in (best, 1.3 * best, 1.3 * self.gap / self.family.swing)
+            for brakes in ((0.0, 0.0), (3e-4, 0.0), (3e-3, 0.0), (0.0, 0.03), (0.0, 0.2))], 100)
+
 
 class Answer(NamedTuple):
     """Whether something is known; what, or why not; and what to do about it."""
@@ -218,6 +228,21 @@ def _dead(v: Array, low: float, high: float) -> Array:
 def _leading(v: Array, width: float) -> Array:
     """Play, compensated twice."""
     return np.asarray(2.0 * v - centred(v, width))
+
+
+def coasting(v: Array, width: float, dry: float, viscous: float) -> Array:
+    """Play with a load that runs on from the side that it leaves, braked by dry friction and by a
+    share of its speed each sample."""
+    half, dry, kept = 0.5 * abs(width), abs(dry), 1.0 - min(abs(viscous), 1.0)
+    place, speed, out = float(v[0]), 0.0, []
+    for value in v.tolist():
+        speed = copysign(max(kept * abs(speed) - dry, 0.0), speed)
+        on = min(max(place + speed, value - half), value + half)
+        if on != place + speed:
+            speed = on - place
+        place = on
+        out.append(place)
+    return np.array(out)
 
 
 def _many(v: Array, widest: float, share: float) -> Array:
@@ -344,24 +369,6 @@ def _stick_slip(o: Observed) -> Figures:
     return {'stuck': stuck, 'jump': float(np.percentile(np.abs(np.diff(y)), 99.0))}
 
 
-def _in_gap(o: Observed) -> Figures:
-    """A load that moves while v crosses the gap."""
-    crossing = np.append(False, (np.diff(o.p) == 0.0) & (np.diff(o.v) != 0.0))
-    known = np.isfinite(o.residual)
-    within, engaged = o.residual[known & crossing], o.residual[known & ~crossing]
-    if o.gap < 0.003 * float(np.ptp(o.v)) or min(len(within), len(engaged)) < 20:
-        return None
-    inside, outside = (float(np.sqrt(np.mean(part**2))) for part in (within, engaged))
-    if inside < 2.0 * max(outside, o.noise):
-        return None
-    # The way p went before it stopped.
-    went = np.sign(np.append(0.0, np.diff(o.p)))
-    before = went[np.maximum.accumulate(np.where(went != 0.0, np.arange(len(went)), 0))]
-    onwards = np.mean(within * before[known & crossing]) > 0.5 * np.mean(np.abs(within))
-    return {'inside': inside, 'outside': outside,
-            'what': 'it coasts' if onwards else 'something else moves it'}
-
-
 def _runs(flags: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
     """The indices of each run of true ones."""
     true = np.flatnonzero(flags)
@@ -416,14 +423,11 @@ BESIDE_V = (
 LEFT_OVER = (
     (_stick_slip, 'y sticks and slips: it stays for {stuck:.0%} of the time in which it should '
      'move, and goes on in jumps of up to {jump:.2g}: friction', 'loosen it, or move faster'),
-    (_in_gap, 'while v crosses the gap the load is off by {inside:.3g}, and by {outside:.3g} while '
-     'it is pushed: {what} there', 'brake or hold it, or move more slowly'),
 )
 
 
 def what_it_is(o: Observed) -> Answer | None:
-    """What else than one play y shows, known where there is a play too; None where one explains it.
-    """
+    """What else than one play y shows; None where one explains it."""
     if not o.unexplained:
         return None
     return _first(o, BESIDE_V) or best_other(o) or _first(o, LEFT_OVER)
@@ -448,5 +452,5 @@ def _first(
     for test, reason, cure in symptoms:
         figures = test(o)
         if figures is not None:
-            return Answer(test is _in_gap, reason.format(**figures), cure)
+            return Answer(False, reason.format(**figures), cure)
     return None

@@ -380,8 +380,7 @@ def later(early: StructureSearch, options: Options, progress: Progress) -> Struc
         (one.gap, rows * log(max(one.squares, TINY) / max(scan[0].squares, TINY)))
         for one in alike])))
     # What no G with a backlash explains, any delay explains a little better.
-    other = what_it_is(observed_of(early.samples, best, Units()))
-    if other is not None and not other.known:
+    if what_it_is(observed_of(early.samples, best, Units())):
         return early
     # Poles may stand for a part of a delay: where many fit alike, it is one of the last.
     late = searched(early.samples.v, early.samples.y, options, range(

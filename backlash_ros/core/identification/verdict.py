@@ -104,15 +104,15 @@ class Doubt(NamedTuple):
 
 def judge(f: Findings) -> Verdict:
     """The answers to three questions."""
-    other, changes = what_it_is(f.observed), [*_changes(f)]
+    changes = [*_coasts(f), *_changes(f)]
     doubts = [*_doubts(f), *changes]
     spread = float(np.linalg.norm([doubt.deviation for doubt in doubts]))
-    backlash = other if other is not None and not other.known else \
-        _backlash(f, max(changes or doubts), spread)  # a change makes other orders fit as well
+    told = [doubt for doubt in changes if doubt.deviation > WORTH_A_WORD * f.gap]
+    # What the play is makes other orders fit as well.
+    backlash = what_it_is(f.observed) or _backlash(f, max(told or doubts), spread)
     remarks = [text for true, text in _remarks(f) if true]
     if backlash.known:
-        remarks += [doubt.why for doubt in changes]
-        remarks += [] if other is None else [other.sentence]
+        remarks += [doubt.why for doubt in told]
     return Verdict(backlash, _gain(f), _model(f), spread, tuple(remarks))
 
 
@@ -145,6 +145,16 @@ def _doubts(f: Findings) -> list[Doubt]:
     return doubts
 
 
+def _coasts(f: Findings) -> Iterator[Doubt]:
+    """Where a load that runs on within the gap explains y better, with another gap."""
+    o = f.observed
+    if o.rms > 1.5 * o.noise and o.family is not None:
+        gap = abs(o.coasting.at[0]) * o.family.swing
+        share = min(o.family.share(o.coasting, o.one_play, o.noise), 1.0)
+        yield Doubt(share * abs(gap - f.gap), 'the load coasts while v crosses the gap, which '
+                    f'would be {gap:.3g} with that', 'brake it, or move more slowly')
+
+
 def _backlash(f: Findings, most: Doubt, spread: float) -> Answer:
     """Whether the gap is known, or that there is none."""
     roughly = 0.25  # relative deviation of a gap that is known
@@ -171,7 +181,8 @@ def _backlash(f: Findings, most: Doubt, spread: float) -> Answer:
     if f.gap <= CERTAIN * spread and of_noise and not unexplained:
         return _no_gap(f, spread)
     if spread <= roughly * f.gap and not unexplained:
-        return Answer(True, f'the gap is {f.gap:.4g} ± {spread:.2g}')
+        rough = f', known to {100.0 * spread / f.gap:.2g} % only' * (spread > PRECISE * f.gap)
+        return Answer(True, f'the gap is {f.gap:.4g} ± {spread:.2g}{rough}')
     return Answer(False, f'the gap, about {f.gap:.3g}, is known to ± {spread:.2g} only: {most.why}',
                   most.cure)
 
@@ -249,6 +260,7 @@ def _remarks(f: Findings) -> list[tuple[bool, str]]:
 
 def _changes(f: Findings) -> Iterator[Doubt]:
     """Where the gap is another one from part to part: what no constant gap explains."""
+    half = 0.5  # share of what a constant gap leaves that they explain
     o = f.observed
     if not o.unexplained and f.unexplained <= WORTH_A_WORD * f.gap:
         return
@@ -261,6 +273,6 @@ def _changes(f: Findings) -> Iterator[Doubt]:
         at = np.linspace(over.min(), over.max(), knots)
         hats = np.array([np.interp(over, at, row) for row in np.eye(knots)])
         gaps, other = family.changing(f.gap, hats)
-        if np.ptp(gaps) > 0.1 * f.gap and family.explains(other, one, o.noise, 0.5):
+        if np.ptp(gaps) > 0.1 * f.gap and family.share(other, one, o.noise) >= half:
             yield Doubt(float(np.sqrt(np.mean((gaps @ hats - f.gap) ** 2))),
                         f'the gap changes {what}: ' + ', '.join(f'{gap:.3g}' for gap in gaps), cure)

@@ -142,8 +142,7 @@ def test_noise_that_is_not_white_is_no_nonlinearity(noise: float) -> None:
     wander = lfilter([noise], [1.0, -0.95], np.random.default_rng(8).standard_normal(COUNT))
     o = observed(V, behind(play(V, GAP), 'lag') + wander)
     assert o.unexplained
-    found = what_it_is(o)
-    assert found is None or 'while v crosses' in found.reason
+    assert what_it_is(o) is None
 
 
 @pytest.mark.parametrize('side', ['both', 'one'])
@@ -167,27 +166,13 @@ def test_a_y_that_does_not_return_with_v_is_named() -> None:
     assert 'y creeps by' in named(observed(V, behind(moved, 'lag')))
 
 
-def test_a_load_that_coasts_through_the_gap_is_named_and_leaves_a_play() -> None:
-    p = play(V, GAP)
-    resting = np.append(False, np.diff(p) == 0.0)
-    speed = np.append(0.0, np.diff(p))
-    coast, v, way = np.zeros(COUNT), 0.0, 0.0
-    for k in range(COUNT):
-        v, way = (0.97 * v, way + v) if resting[k] else (speed[k], 0.0)
-        coast[k] = min(max(way, -0.2), 0.2)
-    answer = what_it_is(observed(V, behind(p + coast, 'gain')))
-    assert answer is not None
-    assert answer.known
-    assert 'it coasts there' in answer.reason
-
-
 @pytest.mark.parametrize('plant', ['gain', 'lag', 'two lags'])
 def test_a_gap_that_grows_is_told_from_part_to_part(plant: str) -> None:
     family = LinearFamily(V, behind(play(V, np.linspace(0.5, 0.8, COUNT)), plant))
     ramp = np.linspace(0.0, 1.0, COUNT)
     gaps, found = family.changing(GAP, np.array([1.0 - ramp, ramp]))
     assert gaps == pytest.approx([0.5, 0.8], abs=0.02)
-    assert family.explains(found, family.changing(GAP, np.ones((1, COUNT)))[1], NOISE, 0.5)
+    assert family.share(found, family.changing(GAP, np.ones((1, COUNT)))[1], NOISE) > 0.5
 
 
 def test_a_gap_on_a_part_of_the_way_is_told_though_none_fits_best() -> None:

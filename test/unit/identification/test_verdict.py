@@ -1,5 +1,6 @@
 """The verdict: three answers, each with its reason and the cure, from numbers alone."""
 
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -33,6 +34,7 @@ def test_a_gap_is_known_though_gain_and_middle_are_not() -> None:
         'identified.yaml, which learns the rest'
     )
     assert found.reasons == ()
+    assert verdict(gap_std=0.12).lines[0] == 'the gap is 0.6 ± 0.12, known to 20 % only'
 
 
 @pytest.mark.parametrize(('changed', 'said'), [
@@ -106,6 +108,20 @@ def test_what_is_no_play_is_named_first() -> None:
     found = judge(FOUND._replace(observed=o, evidence=1.0))
     assert 'a dead zone' in found.backlash.reason
     assert not found.backlash.known
+
+
+def test_a_load_that_coasts_is_told_with_the_gap_that_it_hides() -> None:
+    half, u = 0.5 * GAP, [V[0], V[0]]
+    for value in V[1:]:
+        # On by what is left of the last step, as far as the sides of the gap let it.
+        on = u[-1] + 0.97 * (u[-1] - u[-2])
+        u.append(min(max(on, value - half), value + half))
+    found = judge(FOUND._replace(observed=observed(V, behind(np.array(u[1:]), 'lag'), 0.3)))
+    assert not found.backlash.known
+    reason, _, hidden = found.backlash.reason.partition('the load coasts while v crosses the gap')
+    assert reason
+    assert float(re.findall(r'[\d.]+', hidden)[0]) == pytest.approx(GAP, rel=0.05)
+    assert 'move more slowly' in found.backlash.cure
 
 
 def test_a_gap_that_changes_is_told_with_its_values_and_widens_the_deviation() -> None:
