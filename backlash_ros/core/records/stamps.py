@@ -138,8 +138,21 @@ def spread_evenly(t: Array, said: list[str], *signals: Array) -> Array:
         of_run, between = moves[within & known], moves[~within & known]
         if not len(of_run) or not len(between) or of_run.mean() <= 0.5 * between.mean():
             return t
-    period = float(np.median(np.diff(starts)[1:] / lengths[1:-1]))
-    # The first run may have begun before the log did; a pause is between two runs.
-    starts[0] = starts[1] - period * lengths[0]
     said.append(f'up to {lengths[:-1].max()} rows share a stamp, and move: spread evenly')
-    return np.asarray(np.repeat(starts - period * begins, lengths) + period * np.arange(len(t)))
+    place = np.arange(len(t))
+    # The first run may have begun before the log did.
+    period, begin = np.polyfit(begins[1:], starts[1:], 1).tolist()
+    off = starts[1:] - period * begins[1:]
+    if np.ptp(off) <= 1.5 * period:  # no row is missing
+        return np.asarray(begin + fewest_digits(period, 2.0 * float(np.std(off)) / len(t)) * place)
+    period = float(np.median(np.diff(starts)[1:] / lengths[1:-1]))
+    starts[0] = starts[1] - period * lengths[0]
+    steps = np.minimum(period, np.diff(starts, append=np.inf) / lengths)
+    return np.asarray(np.repeat(starts, lengths)
+                      + np.repeat(steps, lengths) * (place - np.repeat(begins, lengths)))
+
+
+def fewest_digits(value: float, deviation: float) -> float:
+    """The number with the fewest digits within a deviation: no more than the stamps bear."""
+    texts = (float(f'{value:.{digits}g}') for digits in range(1, 9))
+    return next((text for text in texts if abs(text - value) <= deviation), value)

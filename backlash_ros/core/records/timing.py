@@ -19,7 +19,7 @@ from backlash_ros.core.loop.sample_counter import CLOCK_SLACK, JITTER
 from backlash_ros.core.records.readings import quantum
 from backlash_ros.core.records.record import Record, RecordError, seconds
 from backlash_ros.core.records.samples import curvature_of, noise_of, rougher
-from backlash_ros.core.records.stamps import typical_step
+from backlash_ros.core.records.stamps import fewest_digits, typical_step
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
@@ -70,7 +70,7 @@ def on_grid(rows: Rows, period: float | None = None, late: bool = False) -> Reco
         what = 'messages of y' if late else 'rows'
         return _numbered_grid(rows, found.numbers, used,
                               f'{cut}{len(rows.t)} {what}, one every {seconds(used)}')
-    inner = steps[steps <= BREAK]
+    inner = steps[steps <= BREAK * max(float(np.median(steps)), 1.0)]
     jitter = 0.5 * float(np.ptp(np.percentile(inner, [16.0, 84.0])))
     # A few odd ones among even stamps are told as well.
     percent = f'{100.0 * (jitter if jitter > 0.005 else float(np.std(inner))):.2g} %'
@@ -147,11 +147,8 @@ def _numbering(t: Array, steps: Array, period: float, late: bool) -> Numbering:
     if not found:
         raise RecordError('t does not rise steadily: give --period S, or cut out one motion')
     best = min(found, key=lambda one: round(float(np.std(one.off)) / one.period, 9))
-    # With the fewest digits within its deviation: no more than the stamps bear.
     deviation = max(2.0 * float(np.std(best.off)), 1e-12 * period) / float(best.numbers[-1])
-    texts = (float(f'{best.period:.{digits}g}') for digits in range(1, 9))
-    return best._replace(period=next(
-        (value for value in texts if abs(value - best.period) <= deviation), best.period))
+    return best._replace(period=fewest_digits(best.period, deviation))
 
 
 def _numbered(times: Array) -> Numbers:

@@ -13,9 +13,10 @@ import re
 import zlib
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from math import nan
+from itertools import chain, compress
+from operator import not_
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,16 +30,14 @@ Array = NDArray[np.float64]
 MOST_BROKEN = 0.1  # share of the lines that may be broken, and of the cells that are no number
 
 
-@dataclass(frozen=True)
-class Table:
+class Table(NamedTuple):
     """Columns of a file. names: as in its head, or '1', '2', … where it has none.
 
-    cells: text (or numbers) of each column, all of one length. comma: whether it is the decimal
-    sign of the numbers.
+    cells: of each column, all of one length. comma: whether it is the decimal sign of the numbers.
     """
 
-    names: tuple[str, ...]
-    cells: tuple[Sequence[str] | Array, ...]
+    names: Sequence[str]
+    cells: Sequence[Sequence[str]]
     comma: bool = False
     notes: tuple[str, ...] = ()
 
@@ -46,10 +45,9 @@ class Table:
         """Stamps (N,), and their unit [s] where the file tells it; raises RecordError."""
         cells = self.cells[self.names.index(name)]
         # As the first ones are.
-        numeric = [isinstance(cell, float) or _number(cell, self.comma) is not None
-                   for cell in cells[:60]]
+        numeric = [_number(cell, self.comma) is not None for cell in cells[:60]]
         if not sum(numeric) > 0.5 * len(numeric):
-            dates = times_of([str(cell) for cell in cells])
+            dates = times_of(cells)
             if np.isfinite(dates).mean() > 0.5:
                 return dates, 1.0
         t = self.numbers(name, 'time')
@@ -65,12 +63,9 @@ class Table:
     def numbers(self, name: str, what: str = 'number') -> Array:
         """A column as numbers (N,), nan where there is none; raises RecordError."""
         not_known = {'', 'nan', 'null', 'none', 'na', 'n/a', '-', '--', 'nil', '?', '#n/a', 'bad',
-                     'missing'}
+                     'missing', 'nat'}
         cells = self.cells[self.names.index(name)]
-        if isinstance(cells, np.ndarray):
-            return cells
-        read = [_number(cell, self.comma) for cell in cells]
-        values = np.array([nan if value is None else value for value in read])
+        values = np.array([_number(cell, self.comma) for cell in cells], dtype=float)
         broken = [k for k in np.flatnonzero(np.isnan(values)) if cells[k].lower() not in not_known]
         if len(broken) > MOST_BROKEN * len(cells):
             raise RecordError(
@@ -84,20 +79,18 @@ class Table:
 
         The same table where it is none of names and values.
         """
-        of_values = [k for k, name in enumerate(self.names)
-                     if re.fullmatch(r'.*(value|data|reading)', name.lower())]
-        words = [k for k, cells in enumerate(self.cells) if not isinstance(cells, np.ndarray)
-                 and 2 <= len({*cells}) <= 20
-                 and all(cell and _number(cell, self.comma) is None for cell in cells)]
-        if len(of_values) != 1 or len(words) != 1:
+        columns = dict(zip(self.names, self.cells, strict=True))
+        of_values = [name for name in columns
+                     if re.fullmatch('.*(value|data|reading)', name.lower())]
+        of_names = [name for name, cells in columns.items() if 2 <= len({*cells}) <= 20
+                    and all(cell and _number(cell, self.comma) is None for cell in cells)]
+        if len(of_values) != 1 or len(of_names) != 1:
             return self
-        keys, values = self.cells[words[0]], self.cells[of_values[0]]
-        kept = {name: cells for k, (name, cells) in enumerate(
-            zip(self.names, self.cells, strict=True)) if k not in (words[0], of_values[0])}
-        for name in sorted({str(key) for key in keys}):
-            kept.setdefault(name, [str(value) if key == name else ''
-                                   for key, value in zip(keys, values, strict=True)])
-        return replace(self, names=tuple(kept), cells=tuple(kept.values()))
+        keys, values = columns.pop(of_names[0]), columns.pop(of_values[0])
+        for name in sorted({*keys}):
+            columns.setdefault(name, [value if key == name else ''
+                                      for key, value in zip(keys, values, strict=True)])
+        return self._replace(names=tuple(columns), cells=tuple(columns.values()))
 
 
 def _number(cell: str, comma: bool) -> float | None:
@@ -125,58 +118,58 @@ def read_table(path: Path) -> Table:
         'utf-16-le' if b'\0' in data and not data[1:200:2].strip(b'\0') else ''
     if b'\0' in data[:4096] and not wide:
         raise RecordError('is no text: give a CSV, a Parquet file, or the folder of a bag')
-    for encoding in (wide,) if wide else ('utf-8-sig', 'latin-1'):
-        try:
-            return _from_text(data.decode(encoding)).by_name()
-        except UnicodeDecodeError:
-            continue
-    raise RecordError('is no text')
+    try:
+        text = data.decode(wide or 'utf-8-sig')
+    except UnicodeDecodeError:
+        text = data.decode('latin-1')
+    return _from_text(text).by_name()
 
 
 def _from_text(text: str) -> Table:
     lines = [line for line in text.replace('\0', '').replace('−', '-').splitlines()
              if line.strip()]
     comments = [line.lstrip().startswith(('#', '%', '//')) for line in lines]
-    separator, count = _separator(
-        [line for line, comment in zip(lines, comments, strict=True) if not comment])
-    rows = [_split(line.lstrip('#%/ \t') if comment else line.strip(' \r'), separator)
+    separator, count = _separator(list(compress(lines, map(not_, comments))))
+    rows = [_split(line.lstrip('#%/ \t') if comment else line, separator)
             for line, comment in zip(lines, comments, strict=True)]
-    numeric = [any(_number(cell, True) is not None for cell in row) for row in rows]
+    numeric = [_is_numeric(row) for row in rows]
     # A last row may be torn; trailing separators may be missing.
-    data = [count - 1 <= len(row) <= count + 1 and number and not comment
+    data = [abs(len(row) - count) <= 1 and number and not comment
             for row, number, comment in zip(rows, numeric, comments, strict=True)]
     if not count or not any(data):
         raise RecordError(
             'holds no table: give rows of numbers with t, v and y, separated by , ; or tabs')
     # From the middle of the file upwards: a table may stand below other ones.
     first = min(np.flatnonzero(data).tolist(), key=lambda k: abs(k - len(rows) // 2))
-    filled = sum(map(bool, rows[first]))
-
-    def is_head(k: int) -> bool:
-        return k >= 0 and not numeric[k] and sum(map(bool, rows[k])) >= max(2, filled - 1)
-
-    head = next((k for k in range(first - 1, -1, -1) if is_head(k)), -1)
+    wide = max(2, sum(map(bool, rows[first])) - 1)
+    heads = [row for row, number in zip(rows[:first], numeric, strict=False)
+             if not number and sum(map(bool, row)) >= wide]
     # A head that comes again belongs to the same table.
-    head = rows.index(rows[head]) if head >= 0 else head
+    head = rows.index(heads[-1]) if heads else -1
     units: list[str] = []
-    if is_head(head - 1) and _are_units(rows[head]):
+    if len(heads) > 1 and rows[head - 1] == heads[-2] and _are_units(rows[head]):
         units = rows[head]
         head -= 1
-    names = _told_apart(rows[head] if head >= 0 else [], units, count)
-    heads = [units, rows[head]] if head >= 0 else []
-    below = [k for k in range(head + 1, len(rows)) if not comments[k] and rows[k] not in heads]
+    names = _told_apart(rows[head] if heads else [], units, count)
+    below = [k for k in range(head + 1, len(rows))
+             if not comments[k] and rows[k] not in (units, rows[head] if heads else None)]
     body = [[*rows[k], *[''] * (count - len(rows[k]))][:count] for k in below if data[k]]
     skipped = len(below) - len(body)
     if skipped > max(MOST_BROKEN * len(body), 3.0):
         raise RecordError(f'{skipped} of {skipped + len(body)} lines are no rows of its table: '
                           f'{columns_of(names)}; leave one table with t, v and y')
-    cells = [cell for row in body for cell in row]
+    cells = list(chain(*body))
     comma = sum(',' in cell for cell in cells) > sum('.' in cell for cell in cells)
     notes = (f'{skipped} broken line{"s" if skipped > 1 else ""} left out',) if skipped else ()
-    return Table(tuple(names), tuple(zip(*body, strict=True)), comma, notes)
+    return Table(names, list(zip(*body, strict=True)), comma, notes)
+
+
+def _is_numeric(row: Sequence[str]) -> bool:
+    return any(_number(cell, True) is not None for cell in row)
 
 
 def _split(line: str, separator: str) -> list[str]:
+    line = line.strip(' \r')
     if separator == ' ':
         return line.split()
     if '"' not in line:
@@ -187,16 +180,15 @@ def _split(line: str, separator: str) -> list[str]:
         return []
 
 
-def _separator(lines: list[str]) -> tuple[str, int]:
+def _separator(lines: Sequence[str]) -> tuple[str, int]:
     """What separates the cells, and how many a row has; 0 where there is no table."""
     looked_at = 200  # lines by which the separator is told, from the middle of the file
     begin = max(len(lines) // 2 - looked_at // 2, 0)
     part = [line for line in lines[begin:begin + looked_at] if re.search(r'\d', line)]
     best, most = (',', 0), 0.5
     for separator in '\t;,| ':
-        rows = [_split(line.strip(' \r'), separator) for line in part]
-        counts = Counter(len(row) for row in rows if len(row) > 1 and any(
-            _number(cell, True) is not None for cell in row))
+        rows = [_split(line, separator) for line in part]
+        counts = Counter(len(row) for row in rows if len(row) > 1 and _is_numeric(row))
         for count, times in counts.most_common(1):
             # The first of those that explain as much: a comma may be a decimal sign.
             if times / len(part) > 1.05 * most:
@@ -228,12 +220,7 @@ def _from_parquet(path: Path) -> Table:
         raise RecordError('is a Parquet file: pip install pyarrow, or save it as CSV') from None
     try:
         table = parquet.read_table(path)
-        columns = [column.to_numpy() for column in table.columns]
+        cells = [column.to_numpy().astype(str).tolist() for column in table.columns]
     except (ArrowException, OSError, ValueError) as error:
         raise RecordError(f'cannot be read: {" ".join(str(error).split())}') from None
-    return Table(tuple(table.column_names), tuple(
-        column.astype('datetime64[ns]').astype(np.int64) * 1e-9 if column.dtype.kind == 'M' else
-        column.astype(float) if column.dtype.kind in 'iufb' else
-        ['' if cell is None else str(cell).strip() for cell in column.tolist()]
-        for column in columns
-    ))
+    return Table(table.column_names, cells)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.records.record import Record, RecordError
 from backlash_ros.core.records.rows_to_record import record_of
+from backlash_ros.core.records.stamps import spread_evenly
 from backlash_ros.core.records.timing import averaged
 
 Array = NDArray[np.float64]
@@ -116,6 +117,28 @@ def test_equal_stamps_of_a_coarse_clock_keep_the_mean_period() -> None:
         assert record.sample_period == pytest.approx(PERIOD_S, rel=1e-6)
         assert record.lost == 0
         assert off(record) < 1.1e-3
+
+
+def test_stamps_with_too_few_digits_make_no_sample_up() -> None:
+    record = log(even(), stamps=np.round(even(), 1))  # 9 to 11 rows have the same one
+    assert record.sample_period == PERIOD_S
+    assert record.lost == 0
+    assert off(record) < 1.3e-3
+
+
+def test_rows_that_share_a_stamp_end_before_the_next_one() -> None:
+    lost = np.random.default_rng(3).random(COUNT) < 0.1
+    t = even()[~lost]
+    said: list[str] = []
+    spread = spread_evenly(np.floor(t / 0.1) * 0.1, said, command(t))
+    assert said
+    assert (np.diff(spread) > 0.0).all()
+
+
+def test_a_period_shorter_than_the_time_from_row_to_row_leaves_samples_without_a_reading() -> None:
+    record = log(even(), period=0.2 * PERIOD_S)
+    assert record.sample_period == 0.2 * PERIOD_S
+    assert np.isfinite(record.y).sum() == COUNT
 
 
 def test_rows_with_equal_stamps_that_do_not_move_are_one_reading() -> None:
