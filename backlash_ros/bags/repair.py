@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import sqlite3
 import sys
-from collections import Counter
 from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -22,7 +20,7 @@ from backlash_ros.bags.reader import (
     NoBagError,
     Topic,
 )
-from backlash_ros.bags.writer import lock_folder, sync_path
+from backlash_ros.bags.writer import locked_folder, sync_path
 from backlash_ros.options import BAD_INPUT, DONE, FAILED
 
 
@@ -58,27 +56,19 @@ def repair(bag: Path) -> list[str]:
         raise NoBagError(f'{bag}: is a file: give the folder of the bag')
     reader = BagReader(bag)
     try:
-        descriptor = lock_folder(bag)
+        with locked_folder(bag):
+            why = damage(bag)
+            return _rewrite(reader, why) if why else []
     except BlockingIOError:
         raise BagError(f'{bag}: is being recorded: stop its recorder first') from None
-    try:
-        why = damage(bag)
-        return _rewrite(reader, why) if why else []
     except (OSError, sqlite3.Error, WriterError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise BagError(
-            f'{bag}: cannot be repaired: {reason}: is there room for a second copy, and may you '
-            'write there? The bag is as it was'
-        ) from None
-    finally:
-        if descriptor is not None:
-            os.close(descriptor)
+        raise BagError(f'{bag}: cannot be repaired: {reason}: is there room for a second copy, and '
+                       'may you write there? The bag is as it was') from None
 
 
 def _rewrite(reader: BagReader, why: str) -> list[str]:
     bag = reader.path
-    messages: Counter[str] = Counter()
-    first, last = 2**63, 0
     connections: dict[Topic, Connection] = {}
     storage = StoragePlugin[STORAGE_OF_SUFFIX[reader.files[0].suffix].upper()]
     with TemporaryDirectory(dir=bag.parent, prefix=f'{bag.name}.') as folder:
@@ -88,11 +78,8 @@ def _rewrite(reader: BagReader, why: str) -> list[str]:
             for topic, stamp_ns, data in reader.messages():
                 for new in reader.topics - connections.keys():
                     connections[new] = _announce(writer, new)
-                    messages[new.name] += 0
                 writer.write(connections[topic], stamp_ns, data)
-                messages[topic.name] += 1
-                first, last = min(first, stamp_ns), max(last, stamp_ns)
-        if not messages.total():
+        if not any(writer.counts.values()):
             raise BagError(f'{bag}: {why}, and holds no message that could be saved')
         for file in (*repaired.iterdir(), repaired):
             sync_path(file)
@@ -101,10 +88,11 @@ def _rewrite(reader: BagReader, why: str) -> list[str]:
         bag.rename(original)
         repaired.rename(bag)
         sync_path(bag.parent)
-    width = max(map(len, messages))
+    width = max(len(topic.name) for topic in connections)
     return [
-        f'{bag} {why}; saved: {(last - first) * 1e-9:.3f} s',
-        *(f'  {topic:<{width}}  {n:>8} messages' for topic, n in sorted(messages.items())),
+        f'{bag} {why}; saved: {(writer.max_timestamp - writer.min_timestamp) * 1e-9:.3f} s',
+        *sorted(f'  {topic.name:<{width}}  {writer.counts[connection.id]:>8} messages'
+                for topic, connection in connections.items()),
         f'the original is kept: {original}',
     ]
 
@@ -117,5 +105,4 @@ def _announce(writer: Writer, topic: Topic) -> Connection:
     except (TypesysError, KeyError) as error:
         raise BagError(f'the definition of {topic.message_type} is damaged: {error}') from None
     return writer.add_connection(
-        topic.name, topic.message_type, msgdef=topic.definition, rihs01=digest
-    )
+        topic.name, topic.message_type, msgdef=topic.definition, rihs01=digest)

@@ -7,7 +7,7 @@ import os
 import shutil
 import sqlite3
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -33,16 +33,16 @@ class Bag:
     def __init__(self, path: str, storage: str) -> None:
         self.path = Path(path)
         self.saved = self.saved_ns = 0
-        self._types = get_typestore(Stores.ROS2_JAZZY)
-        self._lock: int | None = None
         self.survives_a_crash = True
+        self._types = get_typestore(Stores.ROS2_JAZZY)
+        self._lock = ExitStack()
         if self.path.exists():
             raise ParameterError('bag', path, 'exists already', 'name a new folder')
         self._writer = Writer(self.path, version=9, storage_plugin=StoragePlugin[storage.upper()])
         try:
             with self._closed_on_error():
                 self._writer.open()
-                self._lock = lock_folder(self.path)
+                self._lock.enter_context(locked_folder(self.path))
                 try:
                     self._flush()
                 except AttributeError:
@@ -52,10 +52,8 @@ class Bag:
         except RecordingError as error:
             # Half a bag would be in the way of the next attempt.
             shutil.rmtree(self.path, ignore_errors=True)
-            raise ParameterError(
-                'bag', path, f'cannot be made: {error}',
-                'name a folder where there is room and you may write',
-            ) from None
+            raise ParameterError('bag', path, f'cannot be made: {error}',
+                                 'name a folder where there is room and you may write') from None
 
     def add_topic(self, topic: str, message_type: str) -> Connection:
         """Announce a topic, with a type like std_msgs/msg/Float64; raises RecordingError."""
@@ -80,7 +78,7 @@ class Bag:
             for file in (*self.path.iterdir(), self.path):
                 sync_path(file)
         self._note_saved()
-        self._unlock()
+        self._lock.close()
 
     def _flush(self) -> None:
         """The only place that looks inside of rosbags, which has no such function of its own."""
@@ -107,31 +105,28 @@ class Bag:
             # What does not fit on the disk now did not a moment ago.
             with suppress(OSError, sqlite3.Error):
                 self._writer.abort()
-            self._unlock()
+            self._lock.close()
             text = (error.strerror or '') if isinstance(error, OSError) else ''
             reason = text or ' '.join(str(error).split()) or type(error).__name__
             raise RecordingError(reason) from error
 
-    def _unlock(self) -> None:
-        if self._lock is not None:
-            os.close(self._lock)
-            self._lock = None
 
+@contextmanager
+def locked_folder(path: Path) -> Iterator[None]:
+    """Mark a bag as being written, at most until the process is gone.
 
-def lock_folder(path: Path) -> int | None:
-    """Mark a bag as being written until the descriptor is closed, or the process gone.
-
-    Raises BlockingIOError if another process writes it; None where folders cannot be locked.
+    Raises BlockingIOError if another process writes it. Some file systems cannot lock folders.
     """
     descriptor = os.open(path, os.O_RDONLY)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if isinstance(error, BlockingIOError):
+                raise
+        yield
+    finally:
         os.close(descriptor)
-        if isinstance(error, BlockingIOError):
-            raise
-        return None
-    return descriptor
 
 
 def sync_path(path: Path) -> None:
