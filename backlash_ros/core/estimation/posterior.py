@@ -27,8 +27,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-SCALES: Array = np.append(0.0, np.geomspace(1e-3, 10.0, 13))  # of the error of G that are weighed
-LEAST_SCALE = 3e-4  # as which a scale of 0 counts in its prior
+SCALES = np.asarray(np.geomspace(3e-4, 10.0, 14), np.float64)  # of the error of G that are weighed
 
 # --- readings -----------------------------------------------------------------------------------
 
@@ -58,43 +57,40 @@ def likelihood(r: Array, noise_std: float, step: float) -> Likelihood:
     if not step:
         return Likelihood(
             -0.5 * (r / noise_std) ** 2 - log(sqrt(2.0 * pi) * noise_std), r / noise_std**2,
-            np.full(len(r), noise_std**-2),
-        )
+            np.full(len(r), noise_std**-2))
+    half = 0.5 * step / noise_std
+    probability, score, curvature = _of_interval(r / noise_std, half)
+    # Readings deep within their interval say nothing, and would leave unknowns open.
+    information = np.clip(curvature, mean_information(round(half, 6)), 1.0)
+    return Likelihood(probability - log(step), score / noise_std, information / noise_std**2)
+
+
+def _of_interval(r: Array, half: float) -> tuple[Array, Array, Array]:
+    """Log of the probability of a step of 2 half, its slope by the output, minus its curvature.
+
+    In units of the noise.
+    """
     from scipy.special import log_ndtr  # where fits are made: 31 MB
 
-    upper, lower = (r + 0.5 * step) / noise_std, (r - 0.5 * step) / noise_std
+    upper, lower = r + half, r - half
     # Of both tails the smaller one: the difference of two numbers near 1 would be rounding.
-    mirrored = lower > 0.0
-    more = log_ndtr(np.where(mirrored, -lower, upper))
-    less = log_ndtr(np.where(mirrored, -upper, lower))
-    log_probability = more + np.log(-np.expm1(np.minimum(less - more, -1e-300)))
+    more, less = log_ndtr(half - np.abs(r)), log_ndtr(-half - np.abs(r))
+    probability = more + np.log(-np.expm1(np.minimum(less - more, -1e-300)))
     at_upper, at_lower = (
-        np.exp(-0.5 * edge**2 - log_probability) / sqrt(2.0 * pi) for edge in (upper, lower)
-    )
-    curvature = (at_lower - at_upper) ** 2 + upper * at_upper - lower * at_lower
-    # Readings deep within their interval say nothing, and would leave unknowns open.
-    least = mean_information(round(step / noise_std, 6)) / step**2
-    return Likelihood(
-        log_probability - log(step), (at_lower - at_upper) / noise_std,
-        np.clip(curvature / noise_std**2, least, noise_std**-2),
-    )
+        np.exp(-0.5 * edge**2 - probability) / sqrt(2.0 * pi) for edge in (upper, lower))
+    score = at_lower - at_upper
+    return probability, score, score**2 + upper * at_upper - lower * at_lower
 
 
 @lru_cache(maxsize=256)
-def mean_information(ratio: float) -> float:
-    """Fisher's information of a reading about the output in steps, averaged over the step.
+def mean_information(half: float) -> float:
+    """Fisher's information of a reading about the output, averaged over its step of 2 half.
 
-    ratio: step over the deviation of the noise.
+    In units of the noise.
     """
-    reach, places = 6, 200  # steps to both sides, and places within one, that are averaged
-    from scipy.special import ndtr  # as above
-
-    edges = np.arange(-reach, reach + 2) - 0.5
-    arguments = (edges - ((np.arange(places) + 0.5) / places - 0.5)[:, None]) * ratio
-    chance = np.diff(ndtr(arguments))
-    slope = np.diff(np.exp(-0.5 * arguments**2)) * ratio / sqrt(2.0 * pi)
-    each = np.divide(slope**2, chance, out=np.zeros_like(slope), where=chance > 0.0)
-    return float(each.sum(axis=1).mean())
+    r = np.asarray(np.linspace(-half - 8.0, half + 8.0, 2001), np.float64)
+    probability, score, _ = _of_interval(r, half)
+    return float(score**2 @ np.exp(probability) * (r[1] - r[0]) / (2.0 * half))
 
 
 def independence(
@@ -211,8 +207,7 @@ class WindowFit:
 
     def log_prior(self, older: Prior | None, leaks: int) -> float:
         """Of theta, given what older samples say of it; leaks: how many of xi are leaks."""
-        scale = max(self.scale, LEAST_SCALE)
-        leak, xi = self.theta[3:3 + leaks], self.theta[3 + leaks:]
+        scale, leak, xi = self.scale, self.theta[3:3 + leaks], self.theta[3 + leaks:]
         squares = float(xi @ xi) / scale**2 + float(leak @ leak)
         if older is not None:
             squares += float(np.sum((older.rows @ self.theta - older.values) ** 2))
@@ -239,8 +234,8 @@ class WindowFit:
     @property
     def gap_std(self) -> float:
         """Standard deviation of the gap."""
-        cov = self.crossings_cov
-        return sqrt(max(float(cov[1, 1] + cov[2, 2] - 2.0 * cov[1, 2]), 0.0))
+        by = np.array([0.0, 1.0, -1.0])
+        return sqrt(max(float(by @ self.crossings_cov @ by), 0.0))
 
     @property
     def noise(self) -> float:
@@ -281,24 +276,20 @@ def error_of_plant(
     if not k:
         return np.zeros(0), np.zeros((0, 0)), f.scale, 0.0, 1.0 if f.step else squares / freedom
     u, singular, vt = np.linalg.svd(r[:k, :k])
-    z = u.T @ r[:k, k]
-    scales = SCALES[most_scale >= SCALES][:, None]
+    z, scales = u.T @ r[:k, k], SCALES[most_scale >= SCALES][:, None]
     noise = np.full((len(scales), 1), 1.0 if f.step else squares / freedom)
     for _ in range(1 if f.step else 4):  # noise and shrinkage depend on each other
         shrink = 1.0 / (1.0 + (scales * singular) ** 2 / noise)
         left = squares + (shrink * z**2).sum(axis=1, keepdims=True)
         noise = noise if f.step else left / freedom
-    fits = -0.5 * left[:, 0] if f.step else -0.5 * freedom * np.log(left[:, 0])
-    of_scale = 0.5 * np.log(np.maximum(scales[:, 0], LEAST_SCALE)) ** 2
-    each = fits + 0.5 * np.log(shrink).sum(axis=1) - of_scale
+    fits = left if f.step else freedom * np.log(left)
+    volumes = 0.5 * (np.log(shrink).sum(axis=1) - np.log(scales[:, 0]) ** 2)
+    each = volumes - 0.5 * fits[:, 0]
     share = np.exp(each - each.max())
-    share[1:] *= 0.3  # what a place of the grid stands for beside none at all
     share /= share.sum()
     means = scales**2 / noise * singular * shrink * z
     mean = share @ means
-    spread = np.diag(share @ (scales**2 * shrink))
-    spread += (means - mean).T @ ((means - mean) * share[:, None])
+    spread = np.diag(share @ (scales**2 * shrink)) + (means - mean).T * share @ (means - mean)
     best = int(each.argmax())
-    volume = 0.5 * float(np.log(shrink[best]).sum()) - float(of_scale[best])
-    return (vt.T @ mean, vt.T @ spread @ vt, float(scales[best, 0]), volume,
+    return (vt.T @ mean, vt.T @ spread @ vt, float(scales[best, 0]), float(volumes[best]),
             float(share @ noise[:, 0]))

@@ -69,7 +69,7 @@ def test_density_slope_and_information_belong_together(noise: float, step: float
     near = np.abs(R) < 4.0 * noise
     by_output = -np.gradient(found.log_density, R)
     assert found.score[near] == pytest.approx(by_output[near], abs=1e-3)
-    expected = mean_information(step / noise) / step**2 if step else noise**-2
+    expected = (mean_information(0.5 * step / noise) if step else 1.0) / noise**2
     assert (found.score**2 * density).sum() * APART == pytest.approx(expected, rel=1e-3)
 
 
