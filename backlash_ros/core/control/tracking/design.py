@@ -48,13 +48,15 @@ class Plan:
     """One ideal trajectory.
 
     states (L, n + 1), references (L, N + 1): u* of the next L samples, of [x*; q*] and the
-    references. noise_gains: see ReferenceWindow.
+    references. noise_gains: see ReferenceWindow. x_noise: covariance (n, n) of x* for noise of 1 in
+    references, for each of their averages.
     """
 
     gains: PreviewGains
     states: Array
     references: Array
     noise_gains: Array
+    x_noise: tuple[Array, ...]
 
     def replayed(
         self, model: StateModel, references: Array, history: int,
@@ -98,10 +100,10 @@ class TrackingDesign:
     push: float
     push_ahead: float
 
-    @cached_property
-    def schedule_rows(self) -> Array:
-        """The schedule as a matrix."""
-        return np.array(self.schedule)
+    def variances(self, x_cov: Array) -> Array:
+        """Of K x for every gain of the schedule, and of |x| at last."""
+        gains = np.array(self.schedule)
+        return np.append(((gains @ x_cov) * gains).sum(axis=1), x_cov.trace())
 
     @cached_property
     def schedule_sizes(self) -> list[float]:
@@ -235,14 +237,19 @@ def _plan(model: StateModel, gains: PreviewGains) -> Plan:
         by_state = closed @ by_state
     # What is ahead rests on references that are not averaged yet as well.
     tail = float(np.linalg.norm(references[:, 2 * last // 3:], axis=1).max())
-    return Plan(gains, states, references, np.maximum(_noise_gains(model, gains), tail))
+    u_noise, x_noise = _of_noise(model, gains)
+    return Plan(gains, states, references, np.maximum(u_noise, tail), x_noise)
 
 
-def _noise_gains(model: StateModel, gains: PreviewGains) -> Array:
-    """Standard deviation of u* for noise of 1 on the references, for each of their averages."""
-    closed = model.a - np.outer(model.b, gains.state)
-    response = np.append(1.0, -powers(closed, model.b, HORIZON) @ gains.state)
-    to_u = np.convolve(gains.preview[::-1], response)
-    return np.array([
-        np.linalg.norm(np.convolve(kernel, to_u)) for kernel in averages(len(gains.preview) - 1)
-    ])
+def _of_noise(model: StateModel, gains: PreviewGains) -> tuple[Array, tuple[Array, ...]]:
+    """Deviation of u*, covariance of x* for noise of 1 on the references, for their averages."""
+    responses = powers(model.a - np.outer(model.b, gains.state), model.b, HORIZON)
+    to_u = np.append(1.0, -responses @ gains.state)
+    signals = np.column_stack([to_u, np.vstack([np.zeros(model.order), responses])])
+    u_noise, x_noise = [], []
+    for kernel in averages(len(gains.preview) - 1):
+        weights = np.convolve(kernel, gains.preview[::-1])
+        of_all = np.array([np.convolve(weights, signal) for signal in signals.T])
+        u_noise.append(np.linalg.norm(of_all[0]))
+        x_noise.append(of_all[1:] @ of_all[1:].T)
+    return np.array(u_noise), tuple(x_noise)

@@ -91,9 +91,15 @@ class StateFeedback:
         """Use these gains."""
         self._design = design
         self._x_cov: Array | None = None
-        # Deviations of K x_hat for every gain, and the one in use.
+        self._x_noise: Array | None = None
+        # Variances of K x for every gain and of |x|, by what is unknown of x_hat, and for noise of
+        # 1 in the references.
+        none: Array = np.zeros(len(design.schedule) + 1)
+        self._of_x_hat = self._of_references = none
+        # Deviations of K (x_hat - x*) for every gain, and the one in use.
         self._u_std, self._quiet = [0.0] * len(design.schedule), 0
-        self.x_std = self._ignored = 0.0  # deviation of x_hat, |x_hat - x*| that is left alone
+        # x_std: of x_hat. |x_hat - x*| that is left alone, and that is worth no crossing.
+        self.x_std = self._ignored = self._tolerated = 0.0
 
     def go_on_from(self, other: StateFeedback, state_known: bool) -> None:
         """Go on where another one is; from the softest, where x_hat begins anew and full of noise.
@@ -145,16 +151,28 @@ class StateFeedback:
                      and estimate.std_c_r + estimate.std_c_l < SHARP * large)
             trust.held_for += trust.sharp_counts if sharp else 1
 
-    def prepare(self, x_cov: Array | None, noise_std: float) -> None:
-        """Take in the covariance of x_hat, None where it is unknown, and the noise of y."""
-        if x_cov is not self._x_cov:
-            self._x_cov, gains = x_cov, self._design.schedule_rows
-            if x_cov is not None:
-                variances = ((gains @ x_cov) * gains).sum(axis=1)
-                self._u_std = np.sqrt(np.maximum(variances, 0.0)).tolist()
-                self.x_std = sqrt(max(float(x_cov.trace()), 0.0))
+    def prepare(
+        self, x_cov: Array | None, noise_std: float, x_noise: Array | None = None,
+        reference_noise_std: float = 0.0,
+    ) -> None:
+        """Take in what is unknown of x_hat - x*.
+
+        x_cov: covariance of x_hat, None where it is unknown. noise_std: of y. x_noise: covariance
+        of x* for noise of 1 in the references.
+        """
+        if x_cov is not None and x_cov is not self._x_cov:
+            self._of_x_hat = self._design.variances(x_cov)
+        if x_noise is not None and x_noise is not self._x_noise:
+            self._of_references = self._design.variances(x_noise)
+        self._x_cov, self._x_noise, deviation_std = x_cov, x_noise, 0.0
+        if x_cov is not None:
+            self.x_std = sqrt(max(self._of_x_hat.item(-1), 0.0))
+            variances = self._of_x_hat + reference_noise_std**2 * self._of_references
+            *self._u_std, deviation_std = np.sqrt(np.maximum(variances, 0.0)).tolist()
         # By as much v may rest off: one rule for motion and rest.
         self._ignored = ARRIVED * max(CLOSE * noise_std, UNCERTAIN * self.x_std)
+        # What noise of the references moves and v did not follow shows as a deviation as well.
+        self._tolerated = max(self._ignored, ARRIVED * UNCERTAIN * deviation_std)
         # As hard as leaves what feedback makes of noise below a tenth of the u that the gap takes.
         last, most = len(self._u_std) - 1, 0.1 * self.gap_u or inf
         self._quiet = next((i for i in range(last) if self._noise_of(i) <= most), last)
@@ -166,8 +184,15 @@ class StateFeedback:
             return [0.0] * len(x)
         return [float(x_hat[i]) - each for i, each in enumerate(x)]
 
-    def u(self, deviation: Sequence[float], held_back: bool, largest: float) -> float:
-        """What is taken from u*.
+    @property
+    def knows_noise(self) -> bool:
+        """Whether full feedback can tell a deviation from noise."""
+        return self.trust.full and self._x_cov is not None
+
+    def u(
+        self, deviation: Sequence[float], held_back: bool, largest: float,
+    ) -> tuple[float, float]:
+        """What is taken from u*, and what of it is worth a crossing of the gap.
 
         held_back: whether v met its limits, or is on its way across the gap. largest: |x*| so far.
         """
@@ -176,22 +201,22 @@ class StateFeedback:
         if self.trust.begun:
             off = hypot(*deviation)
             astray = off > max(largest, ASTRAY / ARRIVED * self._ignored)
-            gain = self._gain(held_back or state.bounded, astray)
-            feedback = dot(gain, deviation)
-            if self.trust.full and self._x_cov is not None:
+            feedback = worth = dot(self._gain(held_back or state.bounded, astray), deviation)
+            if self.knows_noise:
                 feedback *= 1.0 - self._ignored / max(off, self._ignored)
+                worth *= 1.0 - self._tolerated / max(off, self._tolerated)
         else:
-            feedback = dot(self._design.acquisition or (), deviation)
+            feedback = worth = dot(self._design.acquisition or (), deviation)
             if not -most < feedback < most:
                 # A gap wider than the first guess has to be crossed some day.
                 state.width = min(widening * state.width, LARGEST_IN_ACQUISITION)
         if self.trust.full:
-            feedback += self._design.feedback.integral * state.integral
-        within = -most <= feedback <= most
-        state.bounded = self.trust.begun and not within
-        if not within:
-            feedback = min(max(feedback, -most), most) if feedback == feedback else 0.0
-        return feedback
+            by_integral = self._design.feedback.integral * state.integral
+            feedback, worth = feedback + by_integral, worth + by_integral
+        state.bounded = self.trust.begun and not -most <= feedback <= most
+        if isnan(feedback):
+            return 0.0, 0.0
+        return min(max(feedback, -most), most), min(max(worth, -most), most)
 
     def integrate(self, difference: float, limited: bool) -> None:
         """Take in y* - y; a saturated actuator cannot follow: going on would only wind up."""

@@ -78,6 +78,7 @@ class ReferenceWindow:
         self._rows: Array = np.zeros((3, 2 * self._kept))
         self._start = self._end = 0
         self._noise = NoiseLevel()
+        self.u_noise_gain = float(noise_gains[0])
         self.u_noise_std = self.noise_spread = self.low = self.high = 0.0
 
     @property
@@ -135,7 +136,8 @@ class ReferenceWindow:
             self.noise_spread = 8.0 * std
             first = self._end - self._preview - 1
             last = max(self._end - half, first + 1)
-            self.u_noise_std = std * float(self._rows[2, first:last].max())
+            self.u_noise_gain = float(self._rows[2, first:last].max())
+            self.u_noise_std = std * self.u_noise_gain
         if self._end == self._rows.shape[1]:
             self._rows[:, :self._kept] = self._rows[:, -self._kept:]
             self._start, self._end = 0, self._kept

@@ -124,7 +124,7 @@ class Tracking(ControlStructure):
         assert isinstance(gains, TrackingDesign)
         self.prepare()
         self._use(gains)
-        self.feedback.prepare(source.x_cov, self._noise_std)
+        self._prepare_feedback(source.x_cov)
         self._change_trajectory(source)
 
     def _change_trajectory(self, source: StateSource) -> None:
@@ -134,7 +134,7 @@ class Tracking(ControlStructure):
         if not trajectory.references.empty:
             state, plan = replace(feedback.state), trajectory.state
             deviation = feedback.deviation(source.x_hat, plan.x)
-            due = plan.u - feedback.u(deviation, False, self.rest.state.largest)
+            due = plan.u - feedback.u(deviation, False, self.rest.state.largest)[0]
             feedback.state = state  # this was no sample
             self.hand_over = HandOver(due=due, widens=True)
             trajectory.advance()  # the plant is at the next sample when the next command is made
@@ -161,11 +161,12 @@ class Tracking(ControlStructure):
         turned = self.trajectory.turn(
             self._noise_std, estimate.m * (estimate.c_r - estimate.c_l), inverse.direction_band,
             crossing)
-        correction = feedback.u(
+        correction, worth = feedback.u(
             deviation, inverse.limited or inverse.taking_up, rest.state.largest)
-        u_d = plan.u - correction
-        # What the noise of the references makes of u* and is not followed shows as a deviation.
-        noise = 4.0 * (feedback.noise + plan.noise_band)
+        noise = 4.0 * feedback.noise + plan.noise_band
+        u_d = plan.aim - correction
+        if feedback.knows_noise:
+            u_d = self._without_crossing(u_d, plan.aim - worth, noise, inverse)
         added = self.hand_over.fade()
         u_d += added
         pull, before = rest.pull_back(deviation, feedback.most), rest.state.mode
@@ -196,10 +197,15 @@ class Tracking(ControlStructure):
             y, x_cov, source = self._newest
             self._newest = None
             self._y_noise.take(y)
-            self.feedback.prepare(x_cov, self._noise_std)
             self.trajectory.prepare()
+            self._prepare_feedback(x_cov)
             if self.feedback.trust.full and self.trajectory.soften(self.feedback.gap_u):
                 self._change_trajectory(source)
+
+    def _prepare_feedback(self, x_cov: NDArray[np.float64] | None) -> None:
+        trajectory = self.trajectory
+        self.feedback.prepare(
+            x_cov, self._noise_std, trajectory.x_noise, trajectory.references.noise_std)
 
     def _go_on(self, estimate: Estimate, inverse: BacklashInverse) -> None:
         """Take in the estimate, and v from whoever has made it until now."""
@@ -223,6 +229,23 @@ class Tracking(ControlStructure):
             trajectory.lead_to(y_m)
         hand_over.leading = False
         return trajectory.take(y_m)
+
+    def _without_crossing(
+        self, wanted: float, worth: float, noise: float, inverse: BacklashInverse,
+    ) -> float:
+        """Return u_d: the u that is wanted where that costs no crossing, else what is worth one.
+
+        What is behind the u that is held makes v cross the gap; what is beyond the furthest u* has
+        to come back across it, and has to be more than noise.
+        """
+        plan, side, (c_r, c_l) = self.trajectory.state, inverse.side, self.feedback.trust.crossings
+        if side is Region.GAP or side is not plan.side or c_r == c_l:
+            return worth
+        held = inverse.held_u * side
+        least, most = min(worth * side, held), max(plan.furthest * side, held)
+        if worth * side > most + noise:
+            most = worth * side
+        return min(max(wanted * side, least), most) * side
 
     def _side(self, turned: bool, u_d: float, noise: float, inverse: BacklashInverse) -> Region:
         """Return the side of the gap for u_d.

@@ -30,8 +30,9 @@ class TrajectoryState:
     """Where the trajectory is, and where it goes.
 
     x: x*, shape (n,). q: q*. side: on which u* moves, GAP until it does. extreme: the furthest u*
-    in that direction, nan before there is one. decided: samples for which the side stays. ahead:
-    u* from this sample on, as far as the references are known. moved: by how much x* did last.
+    in that direction, nan before there is one. decided: samples for which the side stays. furthest:
+    u* to which u is to go without turning. ahead: u* from this sample on, as far as the references
+    are known. moved: by how much x* did last.
     noise_band: how far the noise of the references may turn u*. noise: of u*, what is no turn.
     """
 
@@ -40,6 +41,7 @@ class TrajectoryState:
     side: Region = Region.GAP
     extreme: float = nan
     decided: int = 0
+    furthest: float = nan
     ahead: list[float] = field(default_factory=lambda: [0.0])
     moved: float = 0.0
     noise_band: float = 0.0
@@ -49,6 +51,12 @@ class TrajectoryState:
     def u(self) -> float:
         """u* of this sample."""
         return self.ahead[0]
+
+    @property
+    def aim(self) -> float:
+        """u* of this sample, or what it comes back to without having turned."""
+        passes = self.side is not Region.GAP and (self.u - self.furthest) * self.side > 0.0
+        return self.furthest if passes else self.u
 
     @property
     def back(self) -> float:
@@ -136,7 +144,7 @@ class IdealTrajectory:
         state, ahead = self.state, self.state.ahead
         if isnan(state.extreme):
             state.extreme = ahead[0]
-        before, taken = state.side, ceil(crossing)
+        before, taken, turns = state.side, ceil(crossing), True
         arrival = max(taken - 1, 0)
         # What moves y by less than its noise is no turn, unless it is a hundredth of the gap.
         least = min(noise_std / self._design.push_ahead, 0.01 * gap_u)
@@ -150,13 +158,22 @@ class IdealTrajectory:
                 state.side = Region((first > 0.0) - (first < 0.0))
         else:
             peak = _turn(ahead, state, band, taken)
+            turns = peak is not None
             later = ahead[min(arrival, len(ahead) - 1)]
             if peak is not None and peak < taken and (later - state.extreme) * state.side <= 0.0:
                 state.side = Region(-state.side)
                 state.extreme, state.decided = later, arrival
         if (ahead[0] - state.extreme) * state.side > 0.0 and not state.decided:
             state.extreme = ahead[0]
+        # What is no turn is not followed there and back, but to where it ends.
+        state.furthest = max(ahead, key=lambda u: u * state.side) if turns else ahead[-1]
         return state.side is not before
+
+    @property
+    def x_noise(self) -> Array:
+        """Covariance of x* for noise of 1 in references that are averaged as those in use."""
+        by_width = np.abs(self._plan.noise_gains - self.references.u_noise_gain)
+        return self._plan.x_noise[int(by_width.argmin())]
 
     def advance(self) -> None:
         """Go on to the next sample."""
