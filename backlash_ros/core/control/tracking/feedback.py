@@ -10,14 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import hypot, inf, isnan, nan, sqrt
+from math import hypot, inf, isnan, nan
 
 import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.control.protocol import LARGEST_FEEDBACK, LARGEST_IN_ACQUISITION, dot
 from backlash_ros.core.control.tracking.design import SOFTEST, Gain, TrackingDesign
-from backlash_ros.core.control.tracking.rest import ARRIVED, ASTRAY, CLOSE, TOLERANCE, UNCERTAIN
+from backlash_ros.core.control.tracking.deviation_noise import DeviationNoise
+from backlash_ros.core.control.tracking.rest import ARRIVED, ASTRAY, TOLERANCE
 from backlash_ros.core.estimate import Estimate, Status
 
 Array = NDArray[np.float64]
@@ -82,7 +83,7 @@ class StateFeedback:
 
     def __init__(self, design: TrackingDesign, shrinkage: float, noise_std: float) -> None:
         self.trust, self.state = Trust(), FeedbackState()
-        self._shrinkage, self._noise_std = shrinkage, noise_std
+        self._shrinkage, self._y_std = shrinkage, noise_std
         self._newest: Estimate | None = None
         self.gap_u = 0.0  # that the gap takes
         self.use(design)
@@ -90,16 +91,8 @@ class StateFeedback:
     def use(self, design: TrackingDesign) -> None:
         """Use these gains."""
         self._design = design
-        self._x_cov: Array | None = None
-        self._x_noise: Array | None = None
-        # Variances of K x for every gain and of |x|, by what is unknown of x_hat, and for noise of
-        # 1 in the references.
-        none: Array = np.zeros(len(design.schedule) + 1)
-        self._of_x_hat = self._of_references = none
-        # Deviations of K (x_hat - x*) for every gain, and the one in use.
-        self._u_std, self._quiet = [0.0] * len(design.schedule), 0
-        # x_std: of x_hat. |x_hat - x*| that is left alone, and that is worth no crossing.
-        self.x_std = self._ignored = self._tolerated = 0.0
+        self.noise = DeviationNoise(design, self._y_std)
+        self._quiet = 0  # place of the gain in the schedule that its noise asks for
 
     def go_on_from(self, other: StateFeedback, state_known: bool) -> None:
         """Go on where another one is; from the softest, where x_hat begins anew and full of noise.
@@ -108,7 +101,7 @@ class StateFeedback:
         """
         self.trust, self.state = replace(other.trust), replace(other.state)
         self.gap_u = other.gap_u
-        self.prepare(other._x_cov, self._noise_std)
+        self.prepare(other.noise.x_cov, self._y_std)
         if not state_known:
             self.trust = Trust(sharp_counts=1)
             self.state = replace(self.state, width=1.0, asked=0.0, bounded=False,
@@ -152,30 +145,14 @@ class StateFeedback:
             trust.held_for += trust.sharp_counts if sharp else 1
 
     def prepare(
-        self, x_cov: Array | None, noise_std: float, x_noise: Array | None = None,
-        reference_noise_std: float = 0.0,
+        self, x_cov: Array | None, y_std: float, x_noise: Array | None = None,
+        reference_std: float = 0.0,
     ) -> None:
-        """Take in what is unknown of x_hat - x*.
-
-        x_cov: covariance of x_hat, None where it is unknown. noise_std: of y. x_noise: covariance
-        of x* for noise of 1 in the references.
-        """
-        if x_cov is not None and x_cov is not self._x_cov:
-            self._of_x_hat = self._design.variances(x_cov)
-        if x_noise is not None and x_noise is not self._x_noise:
-            self._of_references = self._design.variances(x_noise)
-        self._x_cov, self._x_noise, deviation_std = x_cov, x_noise, 0.0
-        if x_cov is not None:
-            self.x_std = sqrt(max(self._of_x_hat.item(-1), 0.0))
-            variances = self._of_x_hat + reference_noise_std**2 * self._of_references
-            *self._u_std, deviation_std = np.sqrt(np.maximum(variances, 0.0)).tolist()
-        # By as much v may rest off: one rule for motion and rest.
-        self._ignored = ARRIVED * max(CLOSE * noise_std, UNCERTAIN * self.x_std)
-        # What noise of the references moves and v did not follow shows as a deviation as well.
-        self._tolerated = max(self._ignored, ARRIVED * UNCERTAIN * deviation_std)
+        """Take in what `DeviationNoise` does."""
+        self.noise.take(x_cov, y_std, x_noise, reference_std)
         # As hard as leaves what feedback makes of noise below a tenth of the u that the gap takes.
-        last, most = len(self._u_std) - 1, 0.1 * self.gap_u or inf
-        self._quiet = next((i for i in range(last) if self._noise_of(i) <= most), last)
+        u_std, most = self.noise.u_std, 0.1 * self.gap_u or inf
+        self._quiet = next((i for i, std in enumerate(u_std) if std <= most), len(u_std) - 1)
 
     def deviation(self, x_hat: Sequence[float] | Array, x: Sequence[float]) -> list[float]:
         """x_hat - x*; 0 while x_hat cannot be known."""
@@ -187,7 +164,7 @@ class StateFeedback:
     @property
     def knows_noise(self) -> bool:
         """Whether full feedback can tell a deviation from noise."""
-        return self.trust.full and self._x_cov is not None
+        return self.trust.full and self.noise.known
 
     def u(
         self, deviation: Sequence[float], held_back: bool, largest: float,
@@ -200,11 +177,11 @@ class StateFeedback:
         state, most = self.state, self.most
         if self.trust.begun:
             off = hypot(*deviation)
-            astray = off > max(largest, ASTRAY / ARRIVED * self._ignored)
+            astray = off > max(largest, ASTRAY / ARRIVED * self.noise.ignored)
             feedback = worth = dot(self._gain(held_back or state.bounded, astray), deviation)
             if self.knows_noise:
-                feedback *= 1.0 - self._ignored / max(off, self._ignored)
-                worth *= 1.0 - self._tolerated / max(off, self._tolerated)
+                feedback *= 1.0 - self.noise.ignored / max(off, self.noise.ignored)
+                worth *= 1.0 - self.noise.tolerated / max(off, self.noise.tolerated)
         else:
             feedback = worth = dot(self._design.acquisition or (), deviation)
             if not -most < feedback < most:
@@ -231,13 +208,9 @@ class StateFeedback:
         return max(self.state.asked, self.gap_u)
 
     @property
-    def noise(self) -> float:
+    def noise_u(self) -> float:
         """Standard deviation of what feedback makes of noise."""
-        return self._noise_of(self._quiet)
-
-    def _noise_of(self, level: int) -> float:
-        """By the covariance of x_hat, and at least for errors of y of half its noise."""
-        return max(self._u_std[level], 0.5 * self._noise_std * self._design.schedule_sizes[level])
+        return self.noise.u_std[self._quiet]
 
     @property
     def most(self) -> float:
@@ -250,7 +223,7 @@ class StateFeedback:
         if not self.trust.begun:
             return self.state.width * self._scale
         # |K|: what full feedback makes of an error of y.
-        by_noise = TOLERANCE * self._noise_std * self._design.schedule_sizes[0]
+        by_noise = TOLERANCE * self._y_std * self._design.schedule_sizes[0]
         return LARGEST_FEEDBACK * max(self._scale, by_noise)
 
     @property

@@ -163,7 +163,7 @@ class Tracking(ControlStructure):
             crossing)
         correction, worth = feedback.u(
             deviation, inverse.limited or inverse.taking_up, rest.state.largest)
-        noise = 4.0 * feedback.noise + plan.noise_band
+        noise = 4.0 * feedback.noise_u + plan.noise_band
         u_d = plan.aim - correction
         if feedback.knows_noise:
             u_d = self._without_crossing(u_d, plan.aim - worth, noise, inverse)
@@ -172,7 +172,7 @@ class Tracking(ControlStructure):
         pull, before = rest.pull_back(deviation, feedback.most), rest.state.mode
         spread = max(references.high, y_m) - min(references.low, y_m) - references.noise_spread
         mode = rest.decide(y, self._noise_std, references.window.item(0), spread, plan, deviation,
-                           None if x_cov is None else feedback.x_std, inverse.side, pull,
+                           None if x_cov is None else feedback.noise.x_std, inverse.side, pull,
                            abs(correction) > noise)
         if mode.steps:
             if x_cov is not None:
