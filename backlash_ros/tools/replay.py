@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core.estimate import Status
-from backlash_ros.core.loop.command_history import ReportUse, report_use
+from backlash_ros.core.loop.command_history import report_use
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.parameter import as_yaml
@@ -114,9 +114,9 @@ def _opened(path: Path, options: argparse.Namespace, span: cli.Span) -> Source:
         return Source(path, run.record, parameters, applied)
     use, bag = report_use(parameters), find_bag(path)
     reports: Sequence[Sequence[float]] = ()
-    if use is not ReportUse.NEVER and bag is not None:
+    if use != 'false' and bag is not None:
         reports = read_reports(bag, run.record.column('y'), options.axis)
-    if use is ReportUse.ALWAYS and not reports:
+    if use == 'true' and not reports:
         print(f'replay: warning: {path}: holds no applied_control: v is that of control',
               file=sys.stderr)
     return Source(path, run.record, parameters, reports)

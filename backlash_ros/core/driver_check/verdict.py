@@ -15,7 +15,7 @@ import numpy as np
 from backlash_ros.core.control.limits import plausible
 from backlash_ros.core.driver_check.heard import FEWEST_SAMPLES, Graph, Heard, Sampling, timing_of
 from backlash_ros.core.estimate import Bounds
-from backlash_ros.core.loop.command_history import REPORTED, ReportUse, report_use
+from backlash_ros.core.loop.command_history import REPORTED, report_use
 from backlash_ros.core.loop.diagnosis import SKEW, TROUBLE
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.transfer_function import TransferFunction
@@ -145,11 +145,11 @@ def _lag_and_limit(timing: Sampling) -> tuple[int, float]:
 def _of_reports(heard: Heard, timing: Sampling, p: Parameters) -> Iterator[Row]:
     use, share = report_use(p), len(heard.applied) / max(len(timing.outputs), 1)
     _, limited_by = _lag_and_limit(timing)
-    wanted = use is ReportUse.ALWAYS or (use is ReportUse.AUTO and share > 0.0)
+    wanted = use == 'true' or (use == 'auto' and share > 0.0)
     yield Row('applied_control', wanted and share < REPORTED,
               f'comes with {share:.0%} of the samples' if share else 'is not published',
               'report v just before each y, or set estimator.use_applied_control: false')
-    yield Row('applied_control', use is ReportUse.NEVER and limited_by,
+    yield Row('applied_control', use == 'false' and limited_by,
               f'differs from control by up to {limited_by:.3g}',
               'set estimator.use_applied_control: true, or narrow control.min, max, rate_max',
               well='' if not share else 'is published' if not heard.controls
@@ -176,7 +176,7 @@ def _of_motion(timing: Sampling, p: Parameters) -> Iterator[Row]:
     explained = fit.predicted >= 0.9  # of the motion of y
     yield Row('backlash', fit.reversals == 0 and explained, f'{unseen} on one side', past, MOTION)
     # A report that counts already has the lag by which it follows control.
-    lag = 0 if report_use(p) is ReportUse.ALWAYS else _lag_and_limit(timing)[0]
+    lag = 0 if report_use(p) == 'true' else _lag_and_limit(timing)[0]
     another_delay = fit.margins.get(expected - lag, inf) > 3.0  # log-likelihood
     noisy = best.noise > 3.0 * noise_std  # by more than a guess may be off
     coloured = best.left.correlation > 0.5  # unlike the noise of a sensor

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from enum import Enum
 from math import inf, nan
 
 import numpy as np
@@ -25,46 +24,38 @@ CONSISTENT = 20
 KEPT_COMMANDS = 256
 
 
-class ReportUse(Enum):
-    """Whether the v that the driver reports goes before the own command."""
-
-    NEVER = 'false'
-    AUTO = 'auto'
-    ALWAYS = 'true'
-
-
-def report_use(p: Parameters) -> ReportUse:
+def report_use(p: Parameters) -> str:
     """What estimator.use_applied_control comes to.
 
     With control.delay_samples a driver may report v before or after that delay: auto leaves it
     alone then. In lockstep every v is applied at once.
     """
-    use = ReportUse(p.estimator.use_applied_control)
-    delayed = use is ReportUse.AUTO and p.control.delay_samples > 0
-    return ReportUse.NEVER if delayed or p.lockstep else use
+    use: str = p.estimator.use_applied_control
+    return 'false' if p.lockstep or (use == 'auto' and p.control.delay_samples > 0) else use
 
 
 class ReportTrust:
     """Whether reports are used at present: always, never, or as long as none is missing.
 
     They are from the first one on. A driver that leaves one out before CONSISTENT in a row were
-    there has to show as many first.
+    there has to show as many first. use: as report_use has it.
     """
 
-    def __init__(self, use: ReportUse) -> None:
-        self.trusted = use is ReportUse.ALWAYS
-        self._use = use
+    def __init__(self, use: str) -> None:
+        self.trusted, self._auto = use == 'true', use == 'auto'
         self._contrary = 0  # outputs in a row that speak against `trusted`
         self._first = 0  # outputs in a row that had theirs from the beginning; CONSISTENT: settled
 
     def note(self, complete: bool) -> bool:
         """Note whether each interval before an output had its report; returns `trusted`."""
-        if self._use is ReportUse.AUTO and self._first < CONSISTENT:
+        if not self._auto:
+            return self.trusted
+        if self._first < CONSISTENT:
             self._first = self._first + 1 if complete else CONSISTENT if self.trusted else 0
             self.trusted = complete
             return complete
         self._contrary = 0 if complete is self.trusted else self._contrary + 1
-        if self._use is ReportUse.AUTO and self._contrary == CONSISTENT:
+        if self._contrary == CONSISTENT:
             self.trusted, self._contrary = complete, 0
         return self.trusted
 
@@ -83,8 +74,7 @@ class CommandHistory:
     """
 
     def __init__(
-        self, sample_period_s: float, use: ReportUse = ReportUse.ALWAYS,
-        counts: LoopStatistics | None = None,
+        self, sample_period_s: float, use: str = 'true', counts: LoopStatistics | None = None,
     ) -> None:
         self.counts = counts or LoopStatistics()
         self.trust, self.origin = ReportTrust(use), ReportOrigin()

@@ -43,14 +43,13 @@ class Driver(NamedTuple):
 class Newest:
     """What has come last: y_m; when it and y came, on the steady clock [s]; nan before.
 
-    unanswered: outputs, as long as nobody knew v. before_reports: estimate at the first report.
+    unanswered: outputs, as long as nobody knew v.
     """
 
     y_m: float = nan
     y_m_at: float = nan
     y_at: float = nan
     unanswered: int = 0
-    before_reports: Estimate | None = None
 
 
 class ControlLoop:
@@ -259,17 +258,14 @@ class ControlLoop:
 
     def _has_other_origin(self, report: float, command: float) -> bool:
         """Begin anew where reports turn out to have another origin than what was learned from."""
-        origin = self.commands.origin
-        if origin.begins:
-            self.heard.before_reports = self.estimate
-        report += origin.value
-        if not origin.changed_by(report, command / self.core.command_of(1.0)):
+        origin, scale = self.commands.origin, self.core.command_of(1.0)
+        if not origin.changed_by(report + origin.value, command / scale, self.estimate):
             return False
         self._driver.warn(
             f'{self._driver.applied} is {origin.value:.4g} beyond v: taken for another zero of the '
             'motor encoder, and subtracted'
         )
-        self.renew(self.heard.before_reports)
+        self.renew(origin.before)
         return True
 
     @property

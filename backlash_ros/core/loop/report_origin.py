@@ -8,6 +8,8 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
+from backlash_ros.core.estimate import Estimate
+
 Array = NDArray[np.float64]
 
 LOOKS = 10  # that tell the origin, after which it counts as settled
@@ -24,11 +26,12 @@ class ReportOrigin:
     follow because it is saturated, has p = 1 and tells nothing. What is left of the line has to be
     small beside b: a driver that limits v to one side has no other origin.
 
-    value: b, 0 until another one is certain.
+    value: b, 0 until another one is certain. before: what was known at the first report.
     """
 
     def __init__(self) -> None:
         self.value = 0.0
+        self.before: Estimate | None = None
         self.restart()
 
     def restart(self) -> None:
@@ -37,14 +40,16 @@ class ReportOrigin:
         self._pairs: deque[tuple[float, float]] = deque(maxlen=201)
         self._new = 0  # pairs since the last look
 
-    @property
-    def begins(self) -> bool:
-        """Whether no report was taken in since the start."""
-        return not self._pairs
+    def changed_by(
+        self, report: float, command: float, known: Estimate | None = None,
+    ) -> bool:
+        """Take in what was reported of an interval and commanded in it; whether `value` changed.
 
-    def changed_by(self, report: float, command: float) -> bool:
-        """Take in what was reported of an interval and commanded in it; whether `value` changed."""
+        known: at present. What was learned beside another origin is void.
+        """
         look_after, correlated, significant = 20, 10.0, 5.0  # intervals, intervals, deviations
+        if not self._pairs:
+            self.before = known
         if self._looks == LOOKS:
             return False
         self._pairs.append((report, command))

@@ -58,7 +58,7 @@ def replay(
     lost = np.maximum(np.round(steps).astype(int) - 1, 0)
     controller = build_controller(p)
     rows = np.full((recorded.samples, len(COLUMNS)), np.nan)
-    trust, origin, known = ReportTrust(report_use(p)), ReportOrigin(), controller.estimator.estimate
+    trust, origin = ReportTrust(report_use(p)), ReportOrigin()
     v_before = v_made = 0.0
     for k, (y_m, y, v) in enumerate(zip(*columns, strict=True)):
         y_m, y, v = float(y_m), float(y), float(v)
@@ -76,11 +76,10 @@ def replay(
             controller.start_from(v_before)
         complete = bool(reports) and len(reports[k]) == missing + 1
         if k and trust.note(complete) and complete:
-            if origin.begins:
-                known = controller.estimator.estimate
-            if origin.changed_by(reports[k][-1], v_before / controller.command_of(1.0)):
+            known, scale = controller.estimator.estimate, controller.command_of(1.0)
+            if origin.changed_by(reports[k][-1], v_before / scale, known):
                 # As in the loop: what was learned from them so far goes.
-                before, controller = controller, build_controller(p, known)
+                before, controller = controller, build_controller(p, origin.before)
                 controller.go_on_from(before)
                 controller.start_from(v_before)
                 missing, commands = 0, []

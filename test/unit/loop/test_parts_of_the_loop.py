@@ -7,20 +7,12 @@ from math import isnan
 import numpy as np
 import pytest
 
-from backlash_ros.core.loop import phase as table
 from backlash_ros.core.loop.driver_period import DriverPeriod
 from backlash_ros.core.loop.finding import AGAIN_S, LASTS_S, Finding, Level, LevelLog
 from backlash_ros.core.loop.loop_statistics import Lately, LoopStatistics
-from backlash_ros.core.loop.phase import NEXT, Event, Phase, after
+from backlash_ros.core.loop.phase import Event, Phase, after
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
-
-
-def test_documented_table_is_the_one_that_runs() -> None:
-    assert table.__doc__ is not None
-    lines = [line.split('|')[1:-1] for line in table.__doc__.splitlines() if line.startswith('|')]
-    rows = [[cell.strip() for cell in line] for line in lines[2:]]
-    assert {(Phase(a), Event(b)): Phase(c) for a, b, c, _ in rows} == NEXT
 
 
 @pytest.mark.parametrize(('phase', 'event'), list(product(Phase, Event)))
