@@ -8,12 +8,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from backlash_ros.core.assembly import build_controller, build_model, build_plant, build_reference
+from backlash_ros.core.assembly import build_controller, build_plant, build_reference
 from backlash_ros.core.control.controller import AdaptiveController
 from backlash_ros.core.loop.learned_model import learned_model_of
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.simulated_plant import SimulatedPlant
-from backlash_ros.core.plant.transfer_function import TransferFunction
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord, row_of
 
 
@@ -28,7 +27,7 @@ class ClosedLoop:
     plant: SimulatedPlant
     reference: Callable[[float], float]
     sample_period: float
-    told: TransferFunction
+    p: Parameters
     lose: Callable[[], bool] = field(default=lambda: False)
 
     def run(self, samples: int, on_sample: Callable[[int], None] | None = None) -> RunRecord:
@@ -54,7 +53,7 @@ class ClosedLoop:
         return RunRecord(
             np.array(values).reshape(-1, len(COLUMNS)), self.sample_period,
             self.controller.lost_samples + lost,
-            learned_model_of(self.controller.estimator, self.told),
+            learned_model_of(self.controller.estimator, self.p),
         )
 
 
@@ -67,6 +66,6 @@ def build_closed_loop(p: Parameters) -> ClosedLoop:
         build_plant(p),
         build_reference(p),
         p.sample_period,
-        build_model(p),
+        p,
         lambda: loss > 0.0 and float(rng.random()) < loss,
     )

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.assembly import build_controller, build_model
+from backlash_ros.core.assembly import build_controller
 from backlash_ros.core.control.controller import LONGEST_GAP
 from backlash_ros.core.control.limits import plausible
 from backlash_ros.core.loop.command_history import ReportTrust, report_use
@@ -95,7 +95,7 @@ def replay(
         rows[:, COLUMNS.index(name)] = recorded.column(name)
     return RunRecord(
         rows, recorded.sample_period, recorded.lost_samples,
-        learned_model_of(controller.estimator, build_model(p)),
+        learned_model_of(controller.estimator, p),
     )
 
 

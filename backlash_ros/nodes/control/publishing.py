@@ -15,7 +15,6 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Float64, Float64MultiArray, MultiArrayDimension
 
 from backlash_ros import topics
-from backlash_ros.core.assembly import build_model
 from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.learned_model import learned_model_of
@@ -171,7 +170,7 @@ class ModelPublisher:
 
     def publish(self, loop: ControlLoop, p: Parameters) -> None:
         """Publish at once."""
-        fields = learned_model_of(loop.core.estimator, build_model(p)).fields()
+        fields = learned_model_of(loop.core.estimator, p).fields()
         message = Float64MultiArray()
         message.layout.dim = [
             MultiArrayDimension(label=topics.of_joint(label, self._joint), size=len(values))

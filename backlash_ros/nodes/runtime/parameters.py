@@ -17,7 +17,7 @@ from backlash_ros.core.parameters import Parameters, check_value
 from backlash_ros.core.parameters.errors import UNTOLD, ParameterError
 from backlash_ros.core.parameters.parameter import Parameter, Value
 from backlash_ros.core.parameters.parameter_set import entry_of
-from backlash_ros.core.parameters.table import BY_NAME, CONTROLLER, NODES
+from backlash_ros.core.parameters.table import BY_NAME, CONTROLLER
 
 
 class ParameterNode(Node):
@@ -155,9 +155,8 @@ def _ros_parameter(name: str, value: Value, entry: Parameter) -> RosParameter:
 def complaints(arguments: Sequence[str], executable: str, full_name: str) -> list[str]:
     """A sentence for each section of the given files that was probably meant for this node.
 
-    ROS 2 passes over a section whose name is not that of the node, without a word.
-
-    arguments: of the command line. full_name: of the node, with its namespace.
+    ROS 2 passes over a section whose name is not that of the node, without a word. arguments: of
+    the command line. full_name: of the node, with its namespace.
     """
     found = []
     for option, file in pairwise(arguments):
@@ -174,26 +173,24 @@ def complaints(arguments: Sequence[str], executable: str, full_name: str) -> lis
     return found
 
 
-def unused(sections: Sequence[str], executable: str, full_name: str) -> Iterator[str]:
+def unused(sections: Sequence[str], executable: str, full_name: str) -> list[str]:
     """Sections that do not reach the node though they seem to be meant for it.
 
-    A section of the node's name in another namespace is none of its business where the file has
-    one for its own namespace too, or where both have a namespace: it may be that of another axis.
+    None where another one of its name does. Where node and section both have a namespace, that of
+    the section may be another axis.
     """
     *namespace, own = full_name.strip('/').split('/')
-    last = {section: section.rpartition('/')[2] for section in sections}
-    meant = [section for section in sections if last[section] in (own, executable)]
-    for section in meant:
-        # ** stands for any namespaces.
-        pattern = re.escape(f'/{section.strip("/")}').replace(r'/\*\*', '(/[^/]+)*')
-        if re.fullmatch(pattern.replace(r'/\*', '/[^/]+'), full_name):
-            meant = []
+    meant = []
     for section in sections:
-        of_another_axis = namespace and section.strip('/') != own == last[section]
-        misspelt = last[section] not in (own, *NODES) and '*' not in last[section] \
-            and difflib.get_close_matches(last[section], [executable], cutoff=0.8)
-        if (section in meant and not of_another_axis) or misspelt:
-            yield section
+        *above, last = section.strip('/').split('/')
+        if last == own or difflib.get_close_matches(last, [executable], cutoff=0.8):
+            # ** stands for any namespaces.
+            pattern = re.escape(f'/{section.strip("/")}').replace(r'/\*\*', '(/[^/]+)*')
+            if re.fullmatch(pattern.replace(r'/\*', '/[^/]+'), full_name):
+                return []
+            if not (namespace and above):
+                meant.append(section)
+    return meant
 
 
 def _section_names(content: Any, prefix: str = '') -> Iterator[str]:

@@ -44,7 +44,7 @@ MOTOR = Parameters({
 
 
 def learned(loop: ClosedLoop) -> LearnedModel:
-    return learned_model_of(loop.controller.estimator, loop.told)
+    return learned_model_of(loop.controller.estimator, loop.p)
 
 
 def report(loop: ClosedLoop) -> LawReport:
