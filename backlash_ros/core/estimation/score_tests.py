@@ -90,34 +90,49 @@ def likelier(problem: Problem, fit: WindowFit, record: Window, since: int, back:
     noise = fit.noise * (own_noise if fit.systematic else 1.0)
     noise = max(noise, problem.nominal, problem.step_of_readings / sqrt(12.0))
     v, other = record.v.copy(), record.other.copy()
-    chosen: set[int] = set()
+    swapped = before = np.isin(record.first + open_, list(back))
+
+    def added(k: int) -> Array:
+        """To y, where the other command acts over interval k."""
+        acting = np.append(other[k], v[k + 1:k + reach])
+        moved = play(acting, fit.gap, float(p[k - 1]) if k else fit.p0) - p[k:k + reach]
+        return lfilter(b, a, fit.m * moved) * known[k:k + reach]
+
+    # Most move p for one interval alone: for these all is known from what a move by 1 adds.
+    pulse, begin = lfilter(b, a, fit.m * (np.arange(reach) == 0.0)), open_[0]
+
+    def sums(values: Array, weights: Array) -> Array:
+        """Sum of the values from each interval on (K,), so weighted."""
+        padded = np.pad(values[begin:], (0, reach - 1))
+        return np.asarray(np.correlate(padded, weights)[open_ - begin])
+
+    squares = sums(known, pulse**2) - sum(sums(column, pulse)**2 for column in q.T)
     for _ in range(200):  # swaps of one look
         p = play(v, fit.gap, fit.p0)
         more, less = (log(max(count - k, 1) - 0.5) - log(k + 0.5) for k in (late, max(late - 1, 0)))
         rest = residual - q @ (q.T @ residual)
-        best, place, change = 0.0, -1, rest
-        for k in open_.tolist():
-            acting = v[k:k + reach].copy()
-            acting[0] = other[k]
-            moved = play(acting, fit.gap, float(p[k - 1]) if k else fit.p0) - p[k:k + reach]
-            if moved.any():
-                s = lfilter(b, a, fit.m * moved)
-                end = k + len(s)
-                seen = s * known[k:end]
-                explained = q[k:end].T @ seen
-                gain = float(seen @ rest[k:end] - 0.5 * (seen @ seen - explained @ explained))
-                gain /= noise**2
-                gain -= more if (record.first + k in back) == (k in chosen) else -less
-                if gain > best:
-                    best, place, change = gain, k, seen
-        if place < 0:
+        at = _clamped(np.append(fit.p0, p[:-1])[open_], other[open_], fit.gap)
+        moved, after = at - p[open_], np.minimum(open_ + 1, len(v) - 1)
+        gains = moved * sums(rest, pulse) - 0.5 * moved**2 * squares
+        for i in np.flatnonzero((moved != 0.0) & (_clamped(at, v[after], fit.gap) != p[after])):
+            k = int(open_[i])
+            seen = added(k)
+            explained = q[k:k + reach].T @ seen
+            gains[i] = seen @ rest[k:k + reach] - 0.5 * (seen @ seen - explained @ explained)
+        gains = gains / noise**2 - np.where(swapped, -less, more)
+        i = int(np.argmax(np.where(moved != 0.0, gains, 0.0)))
+        if moved[i] == 0.0 or gains[i] <= 0.0:
             break
-        late += 1 if (record.first + place in back) == (place in chosen) else -1
-        v[place], other[place] = other[place], v[place]
-        chosen ^= {place}
-        residual[place:place + len(change)] -= change
-    found = frozenset(record.first + k for k in chosen)
+        k, late = int(open_[i]), late + (-1 if swapped[i] else 1)
+        residual[k:k + reach] -= added(k)
+        v[k], other[k] = other[k], v[k]
+        swapped = swapped ^ (open_ == k)
+    found = frozenset((record.first + open_[swapped != before]).tolist())
     return record.swapped(found), back ^ found
+
+
+def _clamped(before: Array, v: Array, gap: float) -> Array:
+    return np.asarray(np.minimum(np.maximum(before, v), v + gap))
 
 
 def _basis(columns: Array) -> Array:
