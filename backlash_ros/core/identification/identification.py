@@ -209,9 +209,7 @@ def _described(
     free = len(residual) - structure.unknowns
     details = Details(
         s.samples.first, units.v + units.v_size * best.problem.v, observed.y, observed.p,
-        observed.simulated, g,
-        tuple(one._replace(held_out=units.y_size * one.held_out) for one in s.compared), chosen,
-        (units.v_size * s.profile[0], units.y_size * s.profile[1]), held_out)
+        observed.simulated, g, held_out)
     return replace(
         given, m=options.slope, gap=gap, c_r=c_r,
         std={'m': options.slope * gain_std, 'gap': verdict.gap_std,

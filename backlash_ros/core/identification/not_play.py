@@ -1,194 +1,23 @@
 """What is not a play, or not that alone, named by what it is.
 
-Another nonlinearity takes the place of the play, and is compared with it through one and the same
-general linear family: taps, lags of several lengths, an integral, an offset, a drift and a
-characteristic that is not straight. These are solved for exactly, so that no comparison depends on
-the G that was fitted with a play. What moves y beside v is told by the residual of that fit.
+Another nonlinearity takes the place of the play in the same family (linear_family.py); what moves
+y beside v is told by the residual of the fit. Each test returns a sentence, empty where it finds
+nothing.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from math import copysign
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from backlash_ros.core.identification.linear_family import LinearFamily, Observed, centred
 from backlash_ros.core.plant.backlash import play
-from backlash_ros.core.plant.numerics import lfilter
 
 Array = NDArray[np.float64]
-Figures = dict[str, float | str] | None
-
-LAG_LENGTHS = (0.7, 2.0, 6.0, 20.0, 60.0)  # [samples]
-EXPLAINED = 0.95  # share of what a play leaves beyond the noise that another one must explain
-REST = 8  # samples of v at rest, behind as many in which y settles
-
-
-class Candidate(NamedTuple):
-    """Squares that a nonlinearity leaves, its parameters, and what it has y follow."""
-
-    squares: float
-    at: tuple[float, ...]
-    columns: Array
-
-
-class LinearFamily:
-    """Everything linear between the output of a nonlinearity (N,) and y (N,), nan where lost.
-
-    v: scaled to 0 to 1, as are the parameters of nonlinearities.
-    """
-
-    def __init__(self, v: Array, y: Array) -> None:
-        self.low, self.swing = float(v.min()), max(float(np.ptp(v)), 1e-300)
-        self.v = (v - self.low) / self.swing
-        known = np.flatnonzero(np.isfinite(y) & (np.arange(len(y)) >= min(len(y) // 10, 100)))
-        self.rows = known[::max(len(known) // 1500, 1)]
-        self.target = y[self.rows]
-        bend = self.v - self.v.mean()
-        self.common = np.column_stack([
-            np.ones(len(v)), np.linspace(-1.0, 1.0, len(v)), bend**2, bend**3])[self.rows]
-
-    def columns(self, w: Array) -> Array:
-        """Three taps, lags and, last, the integral of w (N,)."""
-        w = w - w.mean()
-        steps = np.diff(w, prepend=[w[0], w[0]])
-        found = [w, steps[1:], np.diff(steps)]
-        for lag in LAG_LENGTHS:
-            a = float(np.exp(-1.0 / lag))
-            found.append(lfilter([1.0 - a], [1.0, -a], w, state=[w[0] * a]))
-        return np.column_stack([*found, np.cumsum(w)])[self.rows]
-
-    def solved(self, columns: Array, part: slice = slice(None)) -> tuple[float, Array]:
-        """Squares left over of a part of the rows, and the solution for columns and `common`."""
-        whole, target = np.column_stack([columns, self.common])[part], self.target[part]
-        scale = np.sqrt(np.einsum('ij,ij->j', whole, whole))
-        scale[scale == 0.0] = 1.0
-        whole /= scale
-        solution = np.linalg.lstsq(whole.T @ whole, whole.T @ target, rcond=1e-13)[0]
-        left = target - whole @ solution
-        return float(left @ left), solution / scale
-
-    def best(
-        self, nonlinearity: Callable[..., Array], starts: Sequence[tuple[float, ...]],
-        evaluations: int = 50,
-    ) -> Candidate:
-        """The best parameters of a nonlinearity of v, from the best two starts."""
-        from scipy.optimize import minimize  # a fifth of the time that a start takes
-
-        def left(at: Sequence[float]) -> float:
-            w = nonlinearity(self.v, *at)
-            return self.solved(self.columns(w))[0] if np.ptp(w) > 0.0 else 1e300
-
-        found = sorted((left(at), at) for at in starts)[:2]
-        for _, at in list(found):
-            result = minimize(left, at, method='Nelder-Mead',
-                              options={'maxfev': evaluations, 'xatol': 1e-4})
-            found.append((float(result.fun), tuple(result.x.tolist())))
-        squares, at = min(found)
-        return Candidate(squares, at, self.columns(nonlinearity(self.v, *at)))
-
-    def changing(self, gap: float, basis: Array) -> tuple[Array, Candidate]:
-        """Gaps [v] of a basis (B, N) that make up the width of a play, from a constant gap.
-
-        Gauss-Newton steps: the linear system, and the widths with it.
-        """
-        widths: Array = np.full(len(basis), max(gap / self.swing, 1e-4))
-        best = widths, Candidate(np.inf, (), np.empty(0))
-        for _ in range(8):
-            half, place = 0.5 * np.maximum(widths @ basis, 0.0), float(self.v[0])
-            held = []
-            for low, high in zip((self.v - half).tolist(), (self.v + half).tolist(), strict=True):
-                place = min(max(place, low), high)
-                held.append(place)
-            p = np.array(held)
-            columns = self.columns(p)
-            squares, solution = self.solved(columns)
-            if not squares < best[1].squares:
-                break
-            best = widths, Candidate(squares, (), columns)
-            side = np.where(p == self.v - half, -0.5, np.where(p == self.v + half, 0.5, 0.0))
-            last = np.maximum.accumulate(np.where(side != 0.0, np.arange(len(side)), 0))
-            moved = [self.columns((side * one)[last]) @ solution[:columns.shape[1]]
-                     for one in basis]
-            widths = widths + self.solved(np.column_stack([*moved, columns]))[1][:len(basis)]
-        return self.swing * np.maximum(best[0], 0.0), best[1]
-
-    def share(self, other: Candidate, one: Candidate, noise: float) -> float:
-        """Of what `one` leaves beyond the noise, what `other` explains; 0 where that is chance."""
-        beyond = max(one.squares - noise**2 * len(self.rows), 1e-300)
-        # Neighbours of smooth residuals tell little of their own.
-        gain = 0.2 * len(self.rows) * np.log(one.squares / max(other.squares, 1e-300))
-        return (one.squares - other.squares) / beyond if gain >= 15.0 else 0.0
-
-    def beats(self, other: Candidate, one: Candidate, noise: float) -> bool:
-        """The same in both halves: what happens to fit one part does not fit the other."""
-        half = len(self.rows) // 2
-        return self.share(other, one, noise) >= EXPLAINED and all(
-            self.solved(other.columns, part)[0]
-            < (1.0 - 0.5 * EXPLAINED) * self.solved(one.columns, part)[0]
-            for part in (slice(0, half), slice(half, None))
-        )
-
-
-@dataclass(frozen=True)
-class Observed:
-    """A record and its fit, N samples each. y: nan where lost. p: play output [v], as it acts on y
-    (the delay is in it). simulated: y without noise. noise: standard deviation of white noise and
-    rounding of y. gap: that of p."""
-
-    v: Array
-    y: Array
-    p: Array
-    simulated: Array
-    noise: float
-    gap: float
-
-    @property
-    def residual(self) -> Array:
-        """y less what was simulated."""
-        return np.asarray(self.y - self.simulated)
-
-    @property
-    def rms(self) -> float:
-        """Of the residual."""
-        return float(np.sqrt(np.nanmean(self.residual**2)))
-
-    @property
-    def swing(self) -> float:
-        """Of y."""
-        return float(np.nanmax(self.y) - np.nanmin(self.y))
-
-    @property
-    def unexplained(self) -> bool:
-        """Whether the residual is more than noise."""
-        return self.rms > max(1.5 * self.noise, 1e-3 * self.swing)
-
-    @cached_property
-    def family(self) -> LinearFamily | None:
-        """To compare nonlinearities by; None where there is too little."""
-        part = slice(0, min(len(self.v), 4000))
-        family = LinearFamily(self.v[part], self.y[part])
-        return family if np.ptp(family.v) > 0.0 and len(family.rows) >= 100 else None
-
-    @cached_property
-    def one_play(self) -> Candidate:
-        """The best play."""
-        assert self.family is not None
-        widths = (6e-4, 3e-3, 0.01, 0.03, 0.1, 0.2, 0.4, 0.6, 0.8, self.gap / self.family.swing)
-        return self.family.best(centred, [(width,) for width in widths])
-
-    @cached_property
-    def coasting(self) -> Candidate:
-        """The best play with a load that coasts within it."""
-        assert self.family is not None
-        best = self.one_play.at[0]
-        return self.family.best(coasting, [
-            (width, *brakes) for width in (best, 1.3 * best, 1.3 * self.gap / self.family.swing)
-            for brakes in ((0.0, 0.0), (3e-4, 0.0), (3e-3, 0.0), (0.0, 0.03), (0.0, 0.2))], 100)
+At = tuple[float, ...]  # parameters of a nonlinearity
 
 
 class Answer(NamedTuple):
@@ -204,13 +33,7 @@ class Answer(NamedTuple):
         return f'{self.reason}: {self.cure}' if self.cure else self.reason
 
 
-# --- nonlinearities of v (N,), scaled to 0 to 1 ---------------------------------------------------
-
-
-def centred(v: Array, width: float) -> Array:
-    """Play about its middle."""
-    width = abs(width)
-    return play(v, width, float(v[0]) + 0.5 * width) - 0.5 * width
+# --- nonlinearities of v (N,), scaled to 0 to 1, and what is said of them -------------------------
 
 
 def _ended(v: Array, width: float, low: float, high: float, beyond: float = 0.0) -> Array:
@@ -220,9 +43,31 @@ def _ended(v: Array, width: float, low: float, high: float, beyond: float = 0.0)
     return np.asarray(within + beyond * (p - within))
 
 
+def _end(o: Observed, f: LinearFamily, at: At) -> str:
+    width, low, high = at
+    squares = [f.solved(f.columns(_ended(f.v, width, low, high, beyond)))[0]
+               for beyond in (0.0, 0.3)]
+    p = centred(f.v, width)
+    on, y = max(((float(beyond.max()), f.target[beyond[f.rows] > 0.0])
+                 for beyond in (p - max(low, high), min(low, high) - p)), key=lambda end: end[0])
+    # A y that only moves less there is at no end.
+    there = squares[0] <= squares[1] and on >= 0.1 and len(y)
+    return _at_end(float(np.median(y)), f.swing * on) if there else ''
+
+
+def _at_end(y: float, on: float) -> str:
+    return (f'y stays at about {y:.4g} while v goes on by {on:.3g} and more: the sensor is at its '
+            'end, or the load slides there')
+
+
 def _dead(v: Array, low: float, high: float) -> Array:
-    """Dead zone."""
     return np.asarray(v - np.clip(v, min(low, high), max(low, high)))
+
+
+def _zone(_: Observed, f: LinearFamily, at: At) -> str:
+    low, high = (f.low + f.swing * end for end in sorted(at))
+    return (f'v does nothing from {low:.4g} to {high:.4g}, from wherever it comes: a dead zone, '
+            'which has no memory, and no backlash')
 
 
 def _leading(v: Array, width: float) -> Array:
@@ -230,19 +75,9 @@ def _leading(v: Array, width: float) -> Array:
     return np.asarray(2.0 * v - centred(v, width))
 
 
-def coasting(v: Array, width: float, dry: float, viscous: float) -> Array:
-    """Play with a load that runs on from the side that it leaves, braked by dry friction and by a
-    share of its speed each sample."""
-    half, dry, kept = 0.5 * abs(width), abs(dry), 1.0 - min(abs(viscous), 1.0)
-    place, speed, out = float(v[0]), 0.0, []
-    for value in v.tolist():
-        speed = copysign(max(kept * abs(speed) - dry, 0.0), speed)
-        on = min(max(place + speed, value - half), value + half)
-        if on != place + speed:
-            speed = on - place
-        place = on
-        out.append(place)
-    return np.array(out)
+def _lead(o: Observed, f: LinearFamily, at: At) -> str:
+    return (f'y leads v by {f.swing * abs(at[0]):.3g} where v turns: the drive compensates a '
+            'backlash already, by too much') * (abs(at[0]) > abs(o.one_play.at[0]) + 0.002)
 
 
 def _many(v: Array, widest: float, share: float) -> Array:
@@ -251,6 +86,11 @@ def _many(v: Array, widest: float, share: float) -> Array:
     held = play(v, widths, v[0] + 0.5 * widths) - 0.5 * widths[:, None]
     share = min(max(share, 0.0), 1.0)
     return np.asarray(share * v + (1.0 - share) * held.mean(axis=0))
+
+
+def _widest(_: Observed, f: LinearFamily, at: At) -> str:
+    return (f'many plays in parallel explain it, up to {f.swing * abs(at[0]):.3g} wide: y turns '
+            'smoothly, as with friction along the way or in a piezo')
 
 
 def _sticking(v: Array, band: float, jump: float) -> Array:
@@ -271,42 +111,16 @@ def _sticking(v: Array, band: float, jump: float) -> Array:
     return np.array(out)
 
 
-# --- figures of the sentences, None where a test finds nothing ------------------------------------
-
-
-def _end(o: Observed, family: LinearFamily, at: tuple[float, ...]) -> Figures:
-    width, low, high = at
-    squares = [family.solved(family.columns(_ended(family.v, width, low, high, beyond)))[0]
-               for beyond in (0.0, 0.3)]
-    p = centred(family.v, width)
-    on, y = max(((float(beyond.max()), family.target[beyond[family.rows] > 0.0])
-                 for beyond in (p - max(low, high), min(low, high) - p)), key=lambda end: end[0])
-    # A y that only moves less there is at no end.
-    if squares[1] < squares[0] or on < 0.1 or not len(y):
-        return None
-    return {'end': float(np.median(y)), 'on': family.swing * on}
-
-
-def _zone(_: Observed, family: LinearFamily, at: tuple[float, ...]) -> Figures:
-    low, high = sorted(at)
-    return {'low': family.low + family.swing * low, 'high': family.low + family.swing * high}
-
-
-def _lead(o: Observed, family: LinearFamily, at: tuple[float, ...]) -> Figures:
-    further = abs(at[0]) > abs(o.one_play.at[0]) + 0.002
-    return {'lead': family.swing * abs(at[0])} if further else None
-
-
-def _widest(_: Observed, family: LinearFamily, at: tuple[float, ...]) -> Figures:
-    return {'widest': family.swing * abs(at[0])}
-
-
-def _stuck(_: Observed, family: LinearFamily, at: tuple[float, ...]) -> Figures:
+def _stuck(_: Observed, f: LinearFamily, at: At) -> str:
     band, jump = abs(at[0]), min(abs(at[1]), abs(at[0]))
-    return {'band': family.swing * band, 'jump': family.swing * jump} if jump > 0.1 * band else None
+    return (f'y sticks until v has gone on by {f.swing * band:.3g} behind each turn, and jumps by '
+            f'what {f.swing * jump:.3g} of v move: friction, as in a valve') * (jump > 0.1 * band)
 
 
-def _held(o: Observed) -> Figures:
+# --- what moves y beside v, or is left over -------------------------------------------------------
+
+
+def _held(o: Observed) -> str:
     """A y that is seen at its end while v goes on."""
     known = np.isfinite(o.y)
     # About 1 or -1, but next to 0 where G integrates.
@@ -318,38 +132,42 @@ def _held(o: Observed) -> Figures:
         on = [float(np.max((o.v[run] - o.v[run[0]]) * way * np.sign(along)))
               for run in _runs(np.abs(o.y - end) < within)]
         if abs(along) > 0.3 and sum(size > far for size in on) >= 3:
-            return {'end': float(end), 'on': max(on)}
-    return None
+            return _at_end(float(end), max(on))
+    return ''
 
 
-def _pushed(o: Observed) -> Figures:
+def _pushed(o: Observed) -> str:
     """A y that moves while v is at rest."""
+    settled = 8  # samples of v at rest, behind as many in which y settles
     rest = np.append(False, (np.diff(o.v) == 0.0) & (np.diff(o.p) == 0.0))
-    parts = [o.residual[run[REST:]] for run in _runs(rest)]
+    parts = [o.residual[run[settled:]] for run in _runs(rest)]
     moved = [float(np.nanmax(part) - np.nanmin(part)) for part in parts
-             if np.isfinite(part).sum() >= REST]
+             if np.isfinite(part).sum() >= settled]
     # Of white noise, the range of a few dozen readings is some four deviations.
     clear = [size for size in moved if size > max(5.0 * o.noise, 0.02 * o.swing)]
-    return {'moved': max(clear)} if len(clear) >= max(2.0, 0.2 * len(moved)) else None
+    return '' if len(clear) < max(2.0, 0.2 * len(moved)) else (
+        f'y moves by up to {max(clear):.3g} while v is at rest: something else moves the load')
 
 
-def _creep(o: Observed) -> Figures:
+def _creep(o: Observed) -> str:
     """A y that goes away though v returns."""
-    family = LinearFamily(o.v, o.y)
+    f = LinearFamily(o.v, o.y)
     # Of a G that integrates, y is where it has been driven to.
-    columns = family.columns((o.p - family.low) / family.swing)
-    left, without = family.solved(columns[:, :-1])
+    columns = f.columns((o.p - f.low) / f.swing)
+    left, without = f.solved(columns[:, :-1])
     # The integral of a p that is not about 0 on the average is a drift of its own.
-    by_time = min(float(family.solved(columns)[1][-3]), float(without[-3]), key=abs)
-    returning = float(np.ptp(family.target - by_time * family.common[:, 1]))
+    by_time = min(float(f.solved(columns)[1][-3]), float(without[-3]), key=abs)
+    returning = float(np.ptp(f.target - by_time * f.common[:, 1]))
     turns = float(np.abs(np.diff(o.p)).sum()) / (2.0 * max(float(np.ptp(o.p)), 1e-300))
-    explained = left < 0.1 * float(np.var(family.target)) * len(family.target)
+    explained = left < 0.1 * float(np.var(f.target)) * len(f.target)
     if not explained or abs(2.0 * by_time) < 0.3 * returning or turns < 3.0:
-        return None
-    return {'way': 2.0 * by_time, 'each': 2.0 * by_time / turns}
+        return ''
+    return (f'y creeps by {2.0 * by_time:.3g} over the record, {2.0 * by_time / turns:.3g} for '
+            'each motion to and fro, though v returns: the way is not the same in both directions, '
+            'or y drifts')
 
 
-def _stick_slip(o: Observed) -> Figures:
+def _stick_slip(o: Observed) -> str:
     """A y that stays where it should move, and then jumps, how far ever."""
     fewest_moves = 20
     known = np.flatnonzero(np.isfinite(o.y) & np.append(False, np.diff(o.p) != 0.0))
@@ -361,12 +179,13 @@ def _stick_slip(o: Observed) -> Figures:
     should = simulated[ahead[begin]] - simulated[begin]
     clear = np.abs(should) > 0.5 * moved
     if np.count_nonzero(clear) < fewest_moves:
-        return None
+        return ''
     share = (y[ahead[begin]] - y[begin])[clear] / should[clear]
     stuck = float(np.mean(np.abs(share) < 0.3))
     if stuck < 0.35 or np.mean(share > 2.0) < 0.04:
-        return None
-    return {'stuck': stuck, 'jump': float(np.percentile(np.abs(np.diff(y)), 99.0))}
+        return ''
+    return (f'y sticks and slips: it stays for {stuck:.0%} of the time in which it should move, '
+            f'and goes on in jumps of up to {np.percentile(abs(np.diff(y)), 99.0):.2g}: friction')
 
 
 def _runs(flags: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
@@ -375,55 +194,36 @@ def _runs(flags: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
     return np.split(true, np.flatnonzero(np.diff(true) > 1) + 1) if len(true) else []
 
 
-# --- what is compared, and what is said -----------------------------------------------------------
-
-AT_END = ('y stays at about {end:.4g} while v goes on by {on:.3g} and more: the sensor is at its '
-          'end, or the load slides there', 'move v less far')
+# --- what is compared -----------------------------------------------------------------------------
 
 
 class Other(NamedTuple):
-    """A nonlinearity, parameters to begin with, what a sentence needs of it, and what to say."""
+    """A nonlinearity, parameters to begin with, what to say of it, and the cure."""
 
     nonlinearity: Callable[..., Array]
-    starts: Callable[[float], Sequence[tuple[float, ...]]]  # of the width of the best play
-    figures: Callable[[Observed, LinearFamily, tuple[float, ...]], Figures]
-    reason: str
+    starts: Callable[[float], Sequence[At]]  # of the width of the best play
+    said: Callable[[Observed, LinearFamily, At], str]
     cure: str
 
 
+LESS_FAR = 'move v less far'
 NONLINEARITIES = (
     Other(_ended, lambda width: [
         (one, low, high) for one in (width, 0.0)
-        for low, high in ((-1.0, 0.75), (0.25, 2.0), (0.2, 0.8), (0.35, 0.65))], _end, *AT_END),
+        for low, high in ((-1.0, 0.75), (0.25, 2.0), (0.2, 0.8), (0.35, 0.65))], _end, LESS_FAR),
     Other(_dead, lambda _: [(middle - half, middle + half) for middle in (0.3, 0.5, 0.7)
-                            for half in (0.03, 0.1, 0.2, 0.3)], _zone,
-          'v does nothing from {low:.4g} to {high:.4g}, from wherever it comes: a dead zone, which '
-          'has no memory, and no backlash',
-          'remove it where it is made, it is not compensated here'),
-    Other(_leading, lambda _: [(width,) for width in (0.003, 0.01, 0.03, 0.1, 0.2, 0.4)], _lead,
-          'y leads v by {lead:.3g} where v turns: the drive compensates a backlash already, by too '
-          'much', 'switch that off, or leave it to it'),
+                            for half in (0.03, 0.1, 0.2, 0.3)],
+          _zone, 'remove it where it is made, it is not compensated here'),
+    Other(_leading, lambda _: [(width,) for width in (0.003, 0.01, 0.03, 0.1, 0.2, 0.4)],
+          _lead, 'switch that off, or leave it to it'),
     Other(_many, lambda _: [(widest, share) for widest in (0.1, 0.3, 0.7) for share in (0.0, 0.4)],
-          _widest, 'many plays in parallel explain it, up to {widest:.3g} wide: y turns smoothly, '
-          'as with friction along the way or in a piezo',
-          'only a single backlash is compensated here'),
+          _widest, 'only a single backlash is compensated here'),
     Other(_sticking, lambda width: [(wider * width, share * width) for wider, share in (
-        (1.05, 0.1), (1.3, 0.4), (1.3, 0.8), (1.0, 0.6))], _stuck,
-          'y sticks until v has gone on by {band:.3g} behind each turn, and jumps by what {jump:.3g'
-          '} of v move: friction, as in a valve', 'loosen it'),
+        (1.05, 0.1), (1.3, 0.4), (1.3, 0.8), (1.0, 0.6))], _stuck, 'loosen it'),
 )
-BESIDE_V = (
-    (_held, *AT_END),
-    (_pushed, 'y moves by up to {moved:.3g} while v is at rest: something else moves the load',
-     'hold it, or keep it free'),
-    (_creep, 'y creeps by {way:.3g} over the record, {each:.3g} for each motion to and fro, though '
-     'v returns: the way is not the same in both directions, or y drifts',
-     'mend what slips, or measure y without a drift'),
-)
-LEFT_OVER = (
-    (_stick_slip, 'y sticks and slips: it stays for {stuck:.0%} of the time in which it should '
-     'move, and goes on in jumps of up to {jump:.2g}: friction', 'loosen it, or move faster'),
-)
+BESIDE_V = ((_held, LESS_FAR), (_pushed, 'hold it, or keep it free'),
+            (_creep, 'mend what slips, or measure y without a drift'))
+LEFT_OVER = ((_stick_slip, 'loosen it, or move faster'),)
 
 
 def what_it_is(o: Observed) -> Answer | None:
@@ -440,17 +240,12 @@ def best_other(o: Observed) -> Answer | None:
         return None
     for other in NONLINEARITIES:
         best = family.best(other.nonlinearity, other.starts(abs(o.one_play.at[0])))
-        figures = family.beats(best, o.one_play, o.noise) and other.figures(o, family, best.at)
-        if figures:
-            found.append((best.squares, other.reason.format(**figures), other.cure))
-    return Answer(False, *min(found)[1:]) if found else None
+        if family.beats(best, o.one_play, o.noise):
+            found.append((best.squares, other.said(o, family, best.at), other.cure))
+    named = [one for one in found if one[1]]
+    return Answer(False, *min(named)[1:]) if named else None
 
 
-def _first(
-    o: Observed, symptoms: Sequence[tuple[Callable[[Observed], Figures], str, str]],
-) -> Answer | None:
-    for test, reason, cure in symptoms:
-        figures = test(o)
-        if figures is not None:
-            return Answer(False, reason.format(**figures), cure)
-    return None
+def _first(o: Observed, tests: Sequence[tuple[Callable[[Observed], str], str]]) -> Answer | None:
+    found = ((test(o), cure) for test, cure in tests)
+    return next((Answer(False, reason, cure) for reason, cure in found if reason), None)

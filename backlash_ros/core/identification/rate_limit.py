@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.identification.not_play import LinearFamily, centred
+from backlash_ros.core.identification.linear_family import LinearFamily, centred
 
 Array = NDArray[np.float64]
 

@@ -62,7 +62,7 @@ class Details(NamedTuple):
     """What pictures show, in units of the record.
 
     first: number of the first y that was fitted; v, y, p, simulated: of each y from there on, v and
-    p as they act on it. profile: gaps (G,), and the rms that G refitted to first order leaves."""
+    p as they act on it."""
 
     first: int
     v: Array
@@ -70,9 +70,6 @@ class Details(NamedTuple):
     p: Array
     simulated: Array
     response: Response
-    compared: tuple[Compared, ...]
-    chosen: Compared
-    profile: tuple[Array, Array]
     held_out: HeldOut
 
 

@@ -224,22 +224,19 @@ def fitted(
     return Model(structure, problem, begin)
 
 
-def moved_to(structure: Structure, like: Model, gap: float | None = None, p0: float | None = None,
-             ) -> WindowFit:
-    """What a fit of a structure may begin with, from the model of one with as many free poles."""
-    fit, theta = like.fit, like.fit.theta
-    begin = np.concatenate([theta[:2], [theta[2] if gap is None else gap],
-                            structure.xi(like.numerator, like.a)])
+def moved_to(
+    structure: Structure, like: Model, gap: float | None = None, p0: float | None = None,
+    factor: Sequence[float] = (1.0,),
+) -> WindowFit:
+    """What a fit of a structure may begin with, from a model.
+
+    factor: (1, -pole) for a structure with a pole more, which a zero cancels.
+    """
+    fit, (m, offset, width) = like.fit, like.fit.theta[:3].tolist()
+    b, a = (np.asarray(np.convolve(one, factor), dtype=float)
+            for one in (like.numerator, np.append(1.0, like.a)))
+    begin = np.append([m, offset, width if gap is None else gap], structure.xi(b, a[1:]))
     return WindowFit(np.zeros(1), fit.p0 if p0 is None else p0, begin, fit.noise_std)
-
-
-def with_pole(structure: Structure, like: Model, pole: float) -> WindowFit:
-    """The same model with a pole more that a zero cancels."""
-    factor = (1.0, -pole)
-    begin = np.concatenate([like.fit.theta[:3], structure.xi(
-        np.asarray(np.convolve(like.numerator, factor)),
-        np.asarray(np.convolve(np.append(1.0, like.a), factor))[1:])])
-    return WindowFit(np.zeros(1), like.fit.p0, begin, like.fit.noise_std)
 
 
 def first_model(

@@ -27,9 +27,9 @@ from numpy.typing import NDArray
 from backlash_ros.core.estimation.fit import FEW_STEPS, FIRST_STEPS
 from backlash_ros.core.estimation.posterior import step_of
 from backlash_ros.core.estimation.search import search
-from backlash_ros.core.estimation.settings import ROWS
 from backlash_ros.core.identification.deviations import by_model, effective
-from backlash_ros.core.identification.not_play import Observed, what_it_is
+from backlash_ros.core.identification.linear_family import Observed
+from backlash_ros.core.identification.not_play import what_it_is
 from backlash_ros.core.identification.result import Compared, HeldOut, Options
 from backlash_ros.core.identification.structure import (
     TINY,
@@ -39,7 +39,6 @@ from backlash_ros.core.identification.structure import (
     first_model,
     fitted,
     moved_to,
-    with_pole,
 )
 from backlash_ros.core.identification.verdict import ANOTHER
 from backlash_ros.core.plant.numerics import lfilter
@@ -67,8 +66,8 @@ class Units(NamedTuple):
 class StructureSearch(NamedTuple):
     """The best of the structures that were compared, in scaled units.
 
-    rivals: other minima (gap, how far behind). profile: gaps, and their rms. apart: deviation of
-    the gap beside the fit's, by a model or a delay that fits alike.
+    rivals: other minima (gap, how far behind). apart: deviation of the gap beside the fit's, by a
+    model or a delay that fits alike.
     """
 
     samples: Samples
@@ -76,7 +75,6 @@ class StructureSearch(NamedTuple):
     chosen: Compared
     best: Model
     rivals: list[tuple[float, float]]
-    profile: tuple[Array, Array]
     held_out: HeldOut
     delays: Sequence[int]
     apart: float = 0.0
@@ -108,7 +106,7 @@ def searched(
         progress('refining')
         for _ in structures:
             chosen = selected(compared)
-            models, profile = _of_gaps(samples, chosen.whole)
+            models = _of_gaps(samples, chosen.whole)
             best = models[0]
             if not gives_way(best, eligible(compared)):
                 break
@@ -125,10 +123,10 @@ def searched(
     held_out = HeldOut(
         cut, samples.y[cut:samples.last], predicted(chosen.trained, replace(samples, first=cut)),
         chosen.held_out, chosen.trained.rms)
-    return StructureSearch(
-        samples, compared, chosen, best, [(gap, behind) for behind, gap in rivals],
-        (profile[0], best.rms * profile[1]), held_out, delays, by_model(best.gap, [
-            (one.whole.gap, one.criterion - chosen.criterion) for one in compared]))
+    apart = by_model(best.gap, [
+        (one.whole.gap, one.criterion - chosen.criterion) for one in compared])
+    return StructureSearch(samples, compared, chosen, best,
+                           [(gap, behind) for behind, gap in rivals], held_out, delays, apart)
 
 
 def _with_general(samples: Samples, delays: Sequence[int]) -> list[Model]:
@@ -142,15 +140,15 @@ def _with_general(samples: Samples, delays: Sequence[int]) -> list[Model]:
     ), key=lambda one: one.squares)
     rough = [fitted(samples, general, one.fit, FEW_STEPS) for one in begins[:2]]
     best = min(rough, key=lambda one: one.squares)
-    models, _ = _of_gaps(samples, best)
+    models = _of_gaps(samples, best)
     # Around another G the search may find another gap.
     if models[0].squares < 0.9 * best.squares and abs(models[0].gap - best.gap) > 0.1 * best.gap:
-        models, _ = _of_gaps(samples, models[0])
+        models = _of_gaps(samples, models[0])
     return models
 
 
-def _of_gaps(samples: Samples, like: Model) -> tuple[list[Model], tuple[Array, Array]]:
-    """Fits of the same structure to the minima over the gap, the best first; the profile."""
+def _of_gaps(samples: Samples, like: Model) -> list[Model]:
+    """Fits of the same structure to the minima over the gap, the best first."""
     most, apart = 4, 0.005  # minima that are fitted, and the relative distance of different ones
     smallest = 2e-3  # gap that is searched for, over the swing of v
     structure, problem = like.structure, like.problem
@@ -170,13 +168,7 @@ def _of_gaps(samples: Samples, like: Model) -> tuple[list[Model], tuple[Array, A
         model = one if one.squares > 1.5 * some[0].squares else fitted(samples, structure, one.fit)
         if all(abs(model.gap - other.gap) > apart * other.gap for other in models):
             models.append(model)
-    models.sort(key=lambda one: one.squares)
-    by_gap: dict[float, float] = {}
-    for h in hypotheses:
-        by_gap[h.gap] = max(h.evidence, by_gap.get(h.gap, -inf))
-    curve = np.array(sorted(by_gap.items())).reshape(-1, 2)
-    behind = curve[:, 1].max(initial=-inf) - curve[:, 1]
-    return models, (curve[:, 0], np.exp(behind / min(len(problem.v), ROWS)))
+    return sorted(models, key=lambda one: one.squares)
 
 
 def without_outliers(samples: Samples, found: Model) -> Samples:
@@ -220,7 +212,8 @@ def compare(
         begins = [trained.fit]
         smaller = done.get(replace(structure, order=structure.order - 1))
         if smaller is not None:
-            begins += [with_pole(structure, smaller.trained, pole) for pole in (0.3, 0.85)]
+            begins += [moved_to(structure, smaller.trained, factor=(1.0, -pole))
+                       for pole in (0.3, 0.85)]
         some = [fitted(train, structure, begin, FIRST_STEPS) for begin in begins]
         trained = min(some, key=lambda one: one.squares)
         done[structure] = _compared(trained, fitted(samples, structure, trained.fit), later)

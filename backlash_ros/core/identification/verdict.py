@@ -12,13 +12,15 @@ from typing import NamedTuple
 import numpy as np
 
 from backlash_ros.core.identification.deviations import by_model, effective, lag_one
-from backlash_ros.core.identification.not_play import Answer, LinearFamily, Observed, what_it_is
+from backlash_ros.core.identification.linear_family import LinearFamily, Observed
+from backlash_ros.core.identification.not_play import Answer, what_it_is
 from backlash_ros.core.records.readings import quantum
 
-PRECISE = 0.1  # relative deviation of gain and G that are known
+PRECISE = 0.1  # relative deviation of gap, gain and G that are known
 CERTAIN = 3.0  # standard deviations of what is there
 ANOTHER = 0.02  # relative distance of two gaps that are not the same
 WORTH_A_WORD = 0.05  # of the motion that the gap makes, that no model explains
+SEVERAL = 'move v at several speeds and amplitudes'
 
 
 class Verdict(NamedTuple):
@@ -47,15 +49,14 @@ class Verdict(NamedTuple):
 
 
 class Findings(NamedTuple):
-    """What there is to judge by.
+    """What there is to judge by, beside the signals of the fitted samples.
 
-    observed: signals of the fitted samples. gap_std, c_r_std: standard deviations [v]. apart: that
-    of the gap by other structures. gain: mean response of y to v where y moves, negative where y
-    moves against v. gain_std, response_std: relative deviations of the gain at rest, and of G where
-    y moves. evidence: log-likelihood by which the fit beats a u that stands still. later: rms of
-    the errors on the samples held out over that on the others. rivals: other gaps with the
-    log-likelihood by which they fall behind. open_delay [samples]: the longest that was compared,
-    where a longer one fits as well, else 0.
+    gap_std, c_r_std [v]; apart: deviation of the gap by other structures. gain: mean response of y
+    to v where y moves, with its sign. gain_std, response_std: relative deviations of the gain at
+    rest, and of G where y moves. evidence: log-likelihood by which the fit beats a u that stands
+    still. later: rms of the errors on the samples held out over that on the others. rivals: other
+    gaps with the log-likelihood by which they fall behind. open_delay: the longest that was
+    compared, where a longer one fits as well, else 0.
     """
 
     observed: Observed
@@ -104,45 +105,39 @@ class Doubt(NamedTuple):
 
 def judge(f: Findings) -> Verdict:
     """The answers to three questions."""
-    changes = [*_coasts(f), *_changes(f)]
-    doubts = [*_doubts(f), *changes]
+    other_plays = [*_coasts(f), *_changes(f)]
+    doubts = [*_doubts(f), *other_plays]
     spread = float(np.linalg.norm([doubt.deviation for doubt in doubts]))
-    told = [doubt for doubt in changes if doubt.deviation > WORTH_A_WORD * f.gap]
+    told = [doubt for doubt in other_plays if doubt.deviation > WORTH_A_WORD * f.gap]
     # What the play is makes other orders fit as well.
     backlash = what_it_is(f.observed) or _backlash(f, max(told or doubts), spread)
-    remarks = [text for true, text in _remarks(f) if true]
-    if backlash.known:
-        remarks += [doubt.why for doubt in told]
+    remarks = [*_remarks(f), *(doubt.why for doubt in told if backlash.known)]
     return Verdict(backlash, _gain(f), _model(f), spread, tuple(remarks))
 
 
-def _doubts(f: Findings) -> list[Doubt]:
+def _doubts(f: Findings) -> Iterator[Doubt]:
     """What the deviation of the gap consists of."""
-    moved, o, several = abs(f.gain) * f.gap, f.observed, 'move v at several speeds and amplitudes'
-    quantised = f.quantum > moved
-    noise = f'y is quantised in steps of {f.quantum:.3g}' if quantised else \
-        f'y has a noise of {o.rms:.2g}'
-    doubts = [
-        Doubt(f.gap_std, f'{noise}, and the gap moves it by {moved:.2g}',
-              'use a finer sensor, or record for longer' if quantised else
-              'record for longer, or turn v more often'),
-        Doubt(0.3 * f.unexplained, 'something else than a backlash and a linear G moves y by '
-              f'{f.unexplained * abs(f.gain):.2g}', 'see the residual on the page: friction, a '
-              'load that moves by itself, or a higher order with --order'),
-        Doubt(f.apart, 'other orders or delays fit nearly as well, with another gap', several),
-        # A delay that is too short by a sample looks like a gap that is wider by its motion of v.
-        Doubt(bool(f.open_delay) * float(np.abs(np.diff(o.v)).mean()),
-              'the delay may be a longer one', 'compare longer ones with --delay'),
-    ]
+    moved, o = abs(f.gain) * f.gap, f.observed
+    what, cure = (
+        (f'is quantised in steps of {f.quantum:.3g}', 'use a finer sensor, or record for longer')
+        if f.quantum > moved else
+        (f'has a noise of {o.rms:.2g}', 'record for longer, or turn v more often'))
+    yield Doubt(f.gap_std, f'y {what}, and the gap moves it by {moved:.2g}', cure)
+    yield Doubt(0.3 * f.unexplained, 'something else than a backlash and a linear G moves y by '
+                f'{f.unexplained * abs(f.gain):.2g}', 'see the residual on the page: friction, a '
+                'load that moves by itself, or a higher order with --order')
+    yield Doubt(f.apart, 'other orders or delays fit nearly as well, with another gap', SEVERAL)
+    # A delay that is too short by a sample looks like a gap that is wider by its motion of v.
+    yield Doubt(bool(f.open_delay) * float(np.abs(np.diff(o.v)).mean()),
+                'the delay may be a longer one', 'compare longer ones with --delay')
     if o.unexplained and o.family is not None:
         gap = abs(o.one_play.at[0]) * o.family.swing
         squares, rows = o.one_play.squares / len(o.family.rows), effective(o.residual)
         # Each of its columns costs as much as an unknown of any other structure.
         unknowns = o.one_play.columns.shape[1] + o.family.common.shape[1]
         behind = rows * log(squares / o.rms**2) + unknowns * log(max(rows, 1.0))
-        doubts.append(Doubt(by_model(f.gap, [(gap, behind)]),
-                            f'with another linear G it would be {gap:.3g}', several))
-    return doubts
+        yield Doubt(by_model(f.gap, [(gap, behind)]),
+                    f'with another linear G it would be {gap:.3g}', SEVERAL)
 
 
 def _coasts(f: Findings) -> Iterator[Doubt]:
@@ -155,27 +150,45 @@ def _coasts(f: Findings) -> Iterator[Doubt]:
                     f'would be {gap:.3g} with that', 'brake it, or move more slowly')
 
 
+def _changes(f: Findings) -> Iterator[Doubt]:
+    """Where the gap is another one from part to part: what no constant gap explains."""
+    half = 0.5  # share of what a constant gap leaves that they explain
+    o = f.observed
+    if not o.unexplained and f.unexplained <= WORTH_A_WORD * f.gap:
+        return
+    family = LinearFamily(o.v, o.y)
+    _, one = family.changing(f.gap, np.ones((1, len(o.v))))
+    for over, knots, what, cure in (
+        (np.arange(len(o.v)), 3, 'within the record', 'take a part of it with --from and --to'),
+        (o.v, 5, 'with the place, from left to right', 'move v where it is one and the same'),
+    ):
+        at = np.linspace(over.min(), over.max(), knots)
+        hats = np.array([np.interp(over, at, row) for row in np.eye(knots)])
+        gaps, other = family.changing(f.gap, hats)
+        if np.ptp(gaps) > 0.1 * f.gap and family.share(other, one, o.noise) >= half:
+            yield Doubt(float(np.sqrt(np.mean((gaps @ hats - f.gap) ** 2))),
+                        f'the gap changes {what}: ' + ', '.join(f'{gap:.3g}' for gap in gaps), cure)
+
+
 def _backlash(f: Findings, most: Doubt, spread: float) -> Answer:
     """Whether the gap is known, or that there is none."""
     roughly = 0.25  # relative deviation of a gap that is known
-    p = f.observed.p
+    p, swing = f.observed.p, f.swing
     way = np.sign(np.diff(p))
     turns = int(np.count_nonzero(np.diff(way[way != 0.0])))
     alike = [rival for rival, behind in f.rivals if behind < 6.0
              and abs(rival - f.gap) > max(5.0 * f.gap_std, ANOTHER * f.gap)]
-    for true, reason, cure in (
-        (f.evidence < 15.0, f'y shows nothing of v, which swung by {f.swing:.4g}',
-         'let v swing wider than the gap, and see that v is what the actuator gets'),
-        (f.gap >= 0.95 * f.swing, f'the gap is at its bound, the swing of v ({f.swing:.4g})',
-         'let v swing wider, past the gap in both directions'),
-        # Fewer leave gap, crossings and start entangled.
-        (turns < 3, f'v went past the gap and back {turns} times, 3 are needed',
-         'move it to and fro more often, or record for longer'),
-        (bool(alike), f'two gaps fit alike, {f.gap:.4g} and {alike[0] if alike else 0.0:.4g}',
-         'move v at several speeds and amplitudes'),
-    ):
-        if true:
-            return Answer(False, reason, cure)
+    if f.evidence < 15.0:
+        return Answer(False, f'y shows nothing of v, which swung by {swing:.4g}', 'let v swing '
+                      'wider than the gap, and see that v is what the actuator gets')
+    if f.gap >= 0.95 * swing:
+        return Answer(False, f'the gap is at its bound, the swing of v ({swing:.4g})',
+                      'let v swing wider, past the gap in both directions')
+    if turns < 3:  # fewer leave gap, crossings and start entangled
+        return Answer(False, f'v went past the gap and back {turns} times, 3 are needed',
+                      'move it to and fro more often, or record for longer')
+    if alike:
+        return Answer(False, f'two gaps fit alike, {f.gap:.4g} and {alike[0]:.4g}', SEVERAL)
     unexplained = f.unexplained > 0.5 * max(f.gap, CERTAIN * f.gap_std)
     of_noise = most.deviation <= max(f.gap_std, 0.3 * f.unexplained)
     if f.gap <= CERTAIN * spread and of_noise and not unexplained:
@@ -198,8 +211,7 @@ def _no_gap(f: Findings, spread: float) -> Answer:
     if f.gain_std > PRECISE:
         return Answer(
             False, f'{text}: the gain of G at rest is not known, and a slow lag looks like a gap',
-            'move v at several speeds, with rests',
-        )
+            'move v at several speeds, with rests')
     # Rounding of v as well as of y leaves a step, and some more while both move.
     if o.rms > max(2.0 * o.noise, 1.5 * f.quantum):
         return Answer(False, f'{text}: the fit leaves {o.rms:.2g}, and the noise of y is '
@@ -214,65 +226,43 @@ def _gain(f: Findings) -> Answer:
     much = f'to {100.0 * f.gain_std:.2g} % only' if f.gain_std < 1.0 else 'not at all'
     return Answer(
         False, f'the gain of G at rest is known {much}, and with it the middle of the gap',
-        'move v further and with rests, or record for longer; a y that drifts hides it',
-    )
+        'move v further and with rests, or record for longer; a y that drifts hides it')
 
 
 def _model(f: Findings) -> Answer:
     """Whether G is known well enough to begin with."""
     spread = f.response_std
+    much = f'{100.0 * spread:.2g} %' if spread < 1.0 else 'nothing'
     if f.c_r_std > f.swing:
         return Answer(
             False, f'the middle of the gap is known to ± {f.c_r_std:.2g} only, further than v '
-            'moved', 'move v further and with rests; a y that drifts hides it',
-        )
+            'moved', 'move v further and with rests; a y that drifts hides it')
+    if spread <= PRECISE:
+        return Answer(True, f'G is known to {much}, good enough to start with')
     if spread <= 0.5:
-        enough = 'good enough to start with' if spread <= PRECISE else 'good enough to start the ' \
-            'controller with plant.uncertainty as in identified.yaml, which learns the rest'
-        colon = ',' if spread <= PRECISE else ':'
-        return Answer(True, f'G is known to {100.0 * spread:.2g} %{colon} {enough}')
-    much = f'{100.0 * spread:.2g} %' if spread < 1.0 else 'nothing'
+        return Answer(True, f'G is known to {much}: good enough to start the controller with '
+                      'plant.uncertainty as in identified.yaml, which learns the rest')
     return Answer(False, f'G, where y moves, is known to {much}',
                   'move v at more speeds, record for longer, or limit --order')
 
 
-def _remarks(f: Findings) -> list[tuple[bool, str]]:
-    """Sentences, each with whether it is true."""
+def _remarks(f: Findings) -> Iterator[str]:
+    """What to know besides, a sentence each."""
     share = f.unexplained / f.gap if f.gap > 0.0 else 0.0
     speeds = np.abs(np.diff(f.observed.v))
     speeds = speeds[speeds > 0.01 * speeds.max(initial=0.0)]
-    return [
-        (f.gain < 0.0 and f.gain_std <= PRECISE, 'y moves against v: the gain of G is negative'),
-        (f.open_delay > 0,
-         f'the delay of {f.open_delay} samples is the longest that was compared, and the gap may '
-         f'have some of a longer one: try --delay {f.open_delay}-{min(2 * f.open_delay + 4, 40)}'),
-        (WORTH_A_WORD < share <= 1.0,
-         f'{share:.0%} of the motion that the gap makes follows from no backlash and no linear G: '
-         'the deviations tell of it'),
-        (len(speeds) > 0 and np.std(speeds) < 0.05 * np.mean(speeds),
-         'v moved at one speed only: a lag before the gap would look like a wider gap; move v at '
-         'several speeds'),
-        (f.later > 2.0 and f.observed.rms > f.observed.noise,
-         f'the last part of the record is predicted {f.later:.2g} times worse than the rest is '
-         'fitted: the plant changed on the way, or the record is short'),
-    ]
-
-
-def _changes(f: Findings) -> Iterator[Doubt]:
-    """Where the gap is another one from part to part: what no constant gap explains."""
-    half = 0.5  # share of what a constant gap leaves that they explain
-    o = f.observed
-    if not o.unexplained and f.unexplained <= WORTH_A_WORD * f.gap:
-        return
-    family = LinearFamily(o.v, o.y)
-    _, one = family.changing(f.gap, np.ones((1, len(o.v))))
-    for over, knots, what, cure in (
-        (np.arange(len(o.v)), 3, 'within the record', 'take a part of it with --from and --to'),
-        (o.v, 5, 'with the place, from left to right', 'move v where it is one and the same'),
-    ):
-        at = np.linspace(over.min(), over.max(), knots)
-        hats = np.array([np.interp(over, at, row) for row in np.eye(knots)])
-        gaps, other = family.changing(f.gap, hats)
-        if np.ptp(gaps) > 0.1 * f.gap and family.share(other, one, o.noise) >= half:
-            yield Doubt(float(np.sqrt(np.mean((gaps @ hats - f.gap) ** 2))),
-                        f'the gap changes {what}: ' + ', '.join(f'{gap:.3g}' for gap in gaps), cure)
+    if f.gain < 0.0 and f.gain_std <= PRECISE:
+        yield 'y moves against v: the gain of G is negative'
+    if f.open_delay:
+        yield (f'the delay of {f.open_delay} samples is the longest that was compared, and the gap '
+               'may have some of a longer one: try '
+               f'--delay {f.open_delay}-{min(2 * f.open_delay + 4, 40)}')
+    if WORTH_A_WORD < share <= 1.0:
+        yield (f'{share:.0%} of the motion that the gap makes follows from no backlash and no '
+               'linear G: the deviations tell of it')
+    if len(speeds) and np.std(speeds) < 0.05 * np.mean(speeds):
+        yield ('v moved at one speed only: a lag before the gap would look like a wider gap; move '
+               'v at several speeds')
+    if f.later > 2.0 and f.observed.rms > f.observed.noise:
+        yield (f'the last part of the record is predicted {f.later:.2g} times worse than the rest '
+               'is fitted: the plant changed on the way, or the record is short')

@@ -17,7 +17,7 @@ from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core.estimates_file import save_estimate
 from backlash_ros.core.identification.actuator import with_actuator
 from backlash_ros.core.identification.identification import identify
-from backlash_ros.core.identification.result import Details, Identification, Options
+from backlash_ros.core.identification.result import Identification, Options
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.parameter import Value
 from backlash_ros.core.records.record import Record
@@ -96,8 +96,8 @@ def write_outcome(
         f'<b>The backlash is {"" if known else "not "}known</b>: {len(found.y)} samples of '
         f'{found.sample_period:g} s from {escape(record.source)}.', [*lines, *refused, *notes],
         [] if details is None else [
-            table(head, constants) + facts([(name, escape(fact)) for name, fact in told], 1),
-            _compared(details)], drawn, None if text is None else (YAML, text)))
+            table(head, constants) + facts([(name, escape(fact)) for name, fact in told], 1)],
+        drawn, None if text is None else (YAML, text)))
     print('\n'.join([
         *lines, *([format_table(head, constants)] if constants else []),
         *(f'{name}: {fact}' for name, fact in told), *(f'note: {note}' for note in notes), *refused,
@@ -133,15 +133,3 @@ def _facts(found: Identification, record: Record) -> list[tuple[str, str]]:
                      f'{actuator.wind_up[0]:.4g} on the right, {actuator.wind_up[1]:.4g} on the '
                      'left'))
     return told
-
-
-def _compared(details: Details) -> str:
-    """The best of each order, with and without an integrator."""
-    best = {(one.structure.order, one.structure.integrator): one
-            for one in sorted(details.compared, key=lambda one: -one.held_out)}
-    head = ('G', 'delay [samples]', 'error on samples held out')
-    return '<h2>Orders compared</h2>' + table(head, [
-        (f'{order} pole{"s" * (order != 1)}' + ', one an integrator' * integrator
-         + ' (taken)' * (one.structure == details.chosen.structure),
-         str(one.structure.delay), f'{one.held_out:.4g}')
-        for (order, integrator), one in sorted(best.items())])

@@ -45,10 +45,6 @@ def pictures(found: Identification) -> Iterator[Picture]:
          'Left: y over v as measured. Right: what the backlash that was found takes from v, over '
          'v: c<sub>r</sub> while v pushes to the right, c<sub>l</sub> to the left, and in between '
          'while v crosses the gap after each turn.', 4.6, _loop),
-        ('gap.png', 'Misfit over the gap',
-         'What is left over for each width of the gap, all else refitted to first order. One '
-         'narrow valley: the gap is known. Two valleys of one depth: it is not.', 4.2,
-         _profile),
         ('residual.png', 'Residual of the fit',
          'y minus the simulation of the whole record. Its autocorrelation should stay within the '
          'band of white noise; the rounding of an encoder may leave it. Over v it should show no '
@@ -95,20 +91,6 @@ def _loop(figure: Figure, found: Identification, details: Details) -> None:
                       label=f'${name}$ = {value:.4g}')
     label(right, 'As found', 'v − u / m', 'v')
     legend_above(right)
-
-
-def _profile(figure: Figure, found: Identification, details: Details) -> None:
-    whole, near = figure.subplots(1, 2)
-    (gaps, rms), std = details.profile, found.std['gap']
-    close = np.abs(gaps - found.gap) <= max(0.21 * found.gap, 2.0 * BAND_STDS * std)
-    for axes, chosen in ((whole, np.full(len(gaps), True)), (near, close)):
-        axes.plot(gaps[chosen], rms[chosen], '.-', color=HUES['m'], markersize=4)
-        axes.axvline(found.gap, color=HUES['c_r'], linewidth=1.0)
-    whole.set_yscale('log')
-    near.axvspan(found.gap - BAND_STDS * std, found.gap + BAND_STDS * std, color=HUES['c_r'],
-                 alpha=0.2, linewidth=0)
-    label(whole, 'Over the swing of v', 'RMS of the residual', 'gap [v]')
-    label(near, f'Near {found.gap:.4g} ± {std:.2g}', '', 'gap [v]')
 
 
 def _residual(figure: Figure, found: Identification, details: Details) -> None:

@@ -52,7 +52,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_all_files_are_written_with_the_numbers_of_the_actuator(result: Path) -> None:
     assert {path.name for path in result.iterdir()} == {
         'identified.yaml', 'identified.json', 'identify.html', 'estimates.json', 'record.csv',
-        'held_out.png', 'loop.png', 'gap.png', 'residual.png', 'bode.png',
+        'held_out.png', 'loop.png', 'residual.png', 'bode.png',
     }
     found = json.loads((result / 'identified.json').read_text())
     assert found['usable'] is True
