@@ -3,10 +3,10 @@
     python benchmarks/joints.py --law lms --rate 100 --seconds 20
 
 A node of the benchmark is the driver of all joints, six simulated plants with play: it publishes
-their outputs every period, waits for the commands that answer them, and asks a bare rclpy node that
-answers with what it gets half a period later. Processor time and memory are those of all processes
-of the controllers, workers included, once the backlash is known; ratios of them say more than the
-figures of a busy machine.
+their outputs every period and waits for the commands that answer them. Half a period later it asks
+a bare rclpy node that answers with what it gets: what is late there is late because of the machine.
+Processor time and memory are those of all processes of the controllers, workers included, once the
+backlash is known; ratios of them say more than the figures of a busy machine.
 """
 
 from __future__ import annotations
@@ -177,7 +177,7 @@ def measure(together: bool, law: str, rate: float, seconds: float) -> list[str]:
         'six joints in one' if together else 'six controllers', f'{start_up:.1f}',
         f'{100.0 * share:.1f}', f'{memory_mb:.0f}', f'{p50:.2f}', f'{p99:.2f}',
         f'{p50 / echo_p50:.2f}', f'{p99 / echo_p99:.2f}', f'{1e3 * np.nanmax(latencies):.1f}',
-        f'{int(np.isnan(latencies).sum())} of {len(latencies)}',
+        f'{int(np.isnan(latencies).sum())} of {len(latencies)}', f'{int(np.isnan(echoes).sum())}',
     ]
 
 
@@ -204,7 +204,7 @@ def main() -> None:
     parser.add_argument('--seconds', type=float, default=20.0)
     options = parser.parse_args()
     header = ('', 'ready [s]', 'processor [%]', 'memory [MB]', 'p50 [ms]', 'p99 [ms]',
-              'p50 / echo', 'p99 / echo', 'max [ms]', 'late')
+              'p50 / echo', 'p99 / echo', 'max [ms]', 'late', 'late echo')
     print(text_table(header, [
         measure(together, options.law, options.rate, options.seconds) for together in (True, False)
     ]))

@@ -233,7 +233,8 @@ class ControllerNode(ManagedNode):
 
         So it does at a SIGTERM that comes meanwhile: whoever sends it will kill the process next.
         """
-        told, longest_s, step_s = time.monotonic(), self.settings.timeout.ramp, self._step_s
+        told, longest_s, step_s = \
+            time.monotonic(), self.settings.timeout.ramp, max(self.settings.sample_period, 1e-3)
         deadline, cut_short = told + longest_s, ''
         while loops.send_next():
             if not cut_short:
@@ -251,11 +252,6 @@ class ControllerNode(ManagedNode):
                 told = time.monotonic()
                 self._diagnose()  # so that who stands down does not take this node for gone
         self._io.publisher.wait_for_all_acked(Duration(nanoseconds=100_000_000))
-
-    @property
-    def _step_s(self) -> float:
-        """Between two commands that end the loop."""
-        return max(self.settings.sample_period, 1e-3)
 
     def cleanup(self) -> None:
         for joint in self.joints:
@@ -376,7 +372,8 @@ class ControllerNode(ManagedNode):
         if loops.give_up_silent():
             if self._ending is None:
                 self._ending = self.create_timer(
-                    self._step_s, self._send_next, clock=self.steady_clock
+                    max(self.settings.sample_period, 1e-3), self._send_next,
+                    clock=self.steady_clock,
                 )
             for joint in self.joints:
                 joint.told = None

@@ -22,47 +22,37 @@ from backlash_ros.nodes.runtime.messages import DEPTH
 
 def neighbours_of(node: Node, io: DriverIo, p: Parameters, rivals: tuple[str, ...]) -> Neighbours:
     """Who is on the topics of the controller. rivals: who else publishes v."""
-    to = io.topics
+    to, own, publishers = io.topics, node.get_fully_qualified_name(), \
+        node.get_publishers_info_by_topic
+    # As the middleware has it: rclpy keeps what was asked for, with zeros for "no limit".
+    offered = [i.qos_profile for i in publishers(to.control) if name_of(i) == own]
+    heard = node.get_subscriptions_info_by_topic(to.control) if offered else []
     return Neighbours(
-        publishers_of(node, to.output, to.output_type, output_qos(p, DEPTH)),
-        publishers_of(node, to.reference, to.reference_type, io.reference_qos),
-        subscribers_of(node, to.control, to.control_type), rivals,
+        _figures(to.output, to.output_type, publishers(to.output), wanted=output_qos(p, DEPTH)),
+        _figures(to.reference, to.reference_type, publishers(to.reference),
+                 wanted=io.reference_qos),
+        _figures(to.control, to.control_type, heard, *offered[:1]), rivals,
     )
 
 
-def publishers_of(node: Node, topic: str, message_type: type[Any], qos: QoSProfile) -> TopicFigures:
-    """Those who publish what the node listens to with this quality of service."""
-    return TopicFigures(topic, message_type.__name__, tuple(
-        _peer(info, message_type, info.qos_profile, qos)
-        for info in node.get_publishers_info_by_topic(topic)
-    ))
+def _figures(
+    topic: str, message_type: type[Any], infos: list[TopicEndpointInfo],
+    offered: QoSProfile | None = None, wanted: QoSProfile | None = None,
+) -> TopicFigures:
+    """Who is on a topic, and what the node itself offers to them or wants of them."""
+    wanted_type = f'{message_type.__module__.split(".")[0]}/msg/{message_type.__name__}'
 
+    def peer(info: TopicEndpointInfo) -> Peer:
+        offers, wants, unfit = offered or info.qos_profile, wanted or info.qos_profile, ''
+        if info.topic_type != wanted_type:
+            unfit = 'type'
+        elif qos_check_compatible(offers, wants)[0] == QoSCompatibility.ERROR:
+            unreliable = offers.reliability == ReliabilityPolicy.BEST_EFFORT \
+                and wants.reliability == ReliabilityPolicy.RELIABLE
+            unfit = 'reliability' if unreliable else 'qos'
+        return Peer(name_of(info), str(info.topic_type).rsplit('/', 1)[-1], unfit)
 
-def subscribers_of(node: Node, topic: str, message_type: type[Any]) -> TopicFigures:
-    """Those who listen to what the node publishes on this topic."""
-    own = node.get_fully_qualified_name()
-    # As the middleware has it: rclpy keeps what was asked for, with zeros for "no limit".
-    offered = [
-        info.qos_profile for info in node.get_publishers_info_by_topic(topic)
-        if name_of(info) == own
-    ]
-    return TopicFigures(topic, message_type.__name__, tuple(
-        _peer(info, message_type, offered[0], info.qos_profile)
-        for info in node.get_subscriptions_info_by_topic(topic) if offered
-    ))
-
-
-def _peer(
-    info: TopicEndpointInfo, message_type: type[Any], offered: QoSProfile, wanted: QoSProfile,
-) -> Peer:
-    package, unfit = message_type.__module__.split('.')[0], ''
-    if info.topic_type != f'{package}/msg/{message_type.__name__}':
-        unfit = 'type'
-    elif qos_check_compatible(offered, wanted)[0] == QoSCompatibility.ERROR:
-        unreliable = offered.reliability == ReliabilityPolicy.BEST_EFFORT \
-            and wanted.reliability == ReliabilityPolicy.RELIABLE
-        unfit = 'reliability' if unreliable else 'qos'
-    return Peer(name_of(info), str(info.topic_type).rsplit('/', 1)[-1], unfit)
+    return TopicFigures(topic, message_type.__name__, tuple(map(peer, infos)))
 
 
 def missing_joint(io: DriverIo, joint: str, p: Parameters) -> list[Finding]:
