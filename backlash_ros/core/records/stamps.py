@@ -141,15 +141,21 @@ def spread_evenly(t: Array, said: list[str], *signals: Array) -> Array:
     said.append(f'up to {lengths[:-1].max()} rows share a stamp, and move: spread evenly')
     place = np.arange(len(t))
     # The first run may have begun before the log did.
-    period, begin = np.polyfit(begins[1:], starts[1:], 1).tolist()
-    off = starts[1:] - period * begins[1:]
-    if np.ptp(off) <= 1.5 * period:  # no row is missing
-        return np.asarray(begin + fewest_digits(period, 2.0 * float(np.std(off)) / len(t)) * place)
-    period = float(np.median(np.diff(starts)[1:] / lengths[1:-1]))
+    steps, counts = np.diff(starts)[1:], lengths[1:-1]
+    whole = steps < 1.5 * np.median(steps)
+    missing = np.round(steps * counts[whole].sum() / steps[whole].sum()) - counts
+    for paused in (np.zeros(len(steps)), np.where(missing > 1.0, missing, 0.0)):
+        number = place + np.repeat(np.cumsum([0.0, 0.0, *paused]), lengths)
+        period, begin = np.polyfit(number[begins[1:]], starts[1:], 1).tolist()
+        off = starts[1:] - period * number[begins[1:]]
+        if np.ptp(off) <= 1.5 * period:  # no single row is missing
+            period = fewest_digits(period, 2.0 * float(np.std(off)) / float(number[-1]))
+            return np.asarray(begin + period * number)
+    period = float(np.median(steps / counts))
     starts[0] = starts[1] - period * lengths[0]
-    steps = np.minimum(period, np.diff(starts, append=np.inf) / lengths)
+    lasting = np.minimum(period, np.diff(starts, append=np.inf) / lengths)
     return np.asarray(np.repeat(starts, lengths)
-                      + np.repeat(steps, lengths) * (place - np.repeat(begins, lengths)))
+                      + np.repeat(lasting, lengths) * (place - np.repeat(begins, lengths)))
 
 
 def fewest_digits(value: float, deviation: float) -> float:

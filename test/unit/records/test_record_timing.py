@@ -119,10 +119,12 @@ def test_equal_stamps_of_a_coarse_clock_keep_the_mean_period() -> None:
         assert off(record) < 1.1e-3
 
 
-def test_stamps_with_too_few_digits_make_no_sample_up() -> None:
-    record = log(even(), stamps=np.round(even(), 1))  # 9 to 11 rows have the same one
+@pytest.mark.parametrize(('lost', 'early_s'), [(0, 0.0), (40, 0.05)])
+def test_stamps_with_too_few_digits_make_no_sample_up(lost: int, early_s: float) -> None:
+    t = np.delete(even(), slice(600, 600 + lost))
+    record = log(t, stamps=np.round(t - early_s, 1))  # 9 to 11 rows have the same one
     assert record.sample_period == PERIOD_S
-    assert record.lost == 0
+    assert record.lost == lost
     assert off(record) < 1.3e-3
 
 
