@@ -9,8 +9,6 @@ Every row is a fixed set of seeded runs, and its figures have the scatter that o
 show. What is worse than in the reference by more than three standard deviations ends it with 1.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os
@@ -29,14 +27,12 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import faults
 import ordinary_motions
-from contract import crossing_rows as crossing
-from contract import following_rows as following
-from contract import learning_rows as learning
-from contract import situation_rows as situation
-from contract import timing_rows as timing
+from contract import crossing_rows, following_rows, learning_rows, situation_rows, timing_rows
 from contract.figures import COMPARED_HEADER, Figure, Row, as_json, compare, show
-from reporting import ROOT, machine, markdown_table, text_table
+from reporting import ROOT, machine, markdown_table, parser_of
 from tqdm import tqdm
+
+from backlash_ros.tools.cli import format_table
 
 REFERENCE = ROOT / 'benchmarks' / 'reference_accuracy.json'
 PAGE = ROOT / 'docs' / 'results' / 'accuracy.md'
@@ -56,29 +52,28 @@ class Measured(NamedTuple):
     alone: bool = False
 
 
+def row_of(module: Any, name: str, run: str = '', figures: str = '', **more: Any) -> Measured:
+    """The row whose functions a module names after it."""
+    return Measured(getattr(module, f'{name}_jobs'), getattr(module, run or f'run_{name}'),
+                    getattr(module, f'{figures or name}_figures'), **more)
+
+
 ROWS: dict[str, Measured] = {
-    **{name: Measured(jobs, run, timing.times_figures, alone=True) for name, jobs, run in (
-        ('step', timing.step_jobs, timing.run_step),
-        ('latency', timing.latency_jobs, timing.run_latency),
-        ('simulate', timing.simulate_jobs, timing.run_simulate),
-        ('identify', timing.identify_jobs, timing.run_identify))},
-    'bound': Measured(learning.bound_jobs, learning.run_job, learning.bound_figures),
-    'losses': Measured(learning.losses_jobs, learning.run_job, learning.bound_figures),
-    'random': Measured(learning.random_jobs, learning.run_random, learning.random_figures),
-    **{f'plants, {loop} loop': Measured(
-        partial(learning.plants_jobs, structure), learning.run_job, learning.plants_figures)
+    **{name: row_of(timing_rows, name, figures='times', alone=True)
+       for name in ('step', 'latency', 'simulate', 'identify')},
+    'bound': row_of(learning_rows, 'bound', 'run_job'),
+    'losses': row_of(learning_rows, 'losses', 'run_job', 'bound'),
+    'random': row_of(learning_rows, 'random'),
+    **{f'plants, {loop} loop': row_of(learning_rows, 'plants', 'run_job')._replace(
+        jobs=partial(learning_rows.plants_jobs, structure))
        for loop, structure in (('open', 'proportional'), ('closed', 'tracking'))},
-    'changes': Measured(learning.changes_jobs, learning.run_job, learning.changes_figures),
-    'following': Measured(
-        following.following_jobs, following.run_following, following.following_figures),
-    'crossings': Measured(
-        crossing.crossing_jobs, crossing.run_crossing, crossing.crossing_figures),
-    'late': Measured(situation.late_jobs, situation.run_late, situation.late_figures),
-    'faults': Measured(situation.faults_jobs, faults.play, situation.faults_figures),
-    'identification': Measured(
-        situation.identification_jobs, situation.run_identification,
-        situation.identification_figures),
-    'gears': Measured(situation.gears_jobs, situation.run_gear, situation.gears_figures),
+    'changes': row_of(learning_rows, 'changes', 'run_job'),
+    'following': row_of(following_rows, 'following'),
+    'crossings': row_of(crossing_rows, 'crossings'),
+    'late': row_of(situation_rows, 'late'),
+    'faults': Measured(situation_rows.faults_jobs, faults.play, situation_rows.faults_figures),
+    'identification': row_of(situation_rows, 'identification'),
+    'gears': row_of(situation_rows, 'gears'),
     'ordinary motions': Measured(
         ordinary_motions.contract_cases, ordinary_motions.run_case,
         ordinary_motions.contract_figures),
@@ -86,7 +81,6 @@ ROWS: dict[str, Measured] = {
 
 
 def measure(name: str, scale: float, workers: int) -> Row:
-    """The figures of a row."""
     row = ROWS[name]
     jobs = row.jobs(scale)
     progress = partial(tqdm, desc=name, total=len(jobs), unit='run', disable=None)
@@ -112,9 +106,7 @@ def _prepare() -> None:
 
 
 def parse_arguments() -> argparse.Namespace:
-    """Options of the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument('--only', nargs='+', metavar='ROW', default=list(ROWS),
                         help=f'of: {"; ".join(ROWS)}')
     parser.add_argument('--scale', type=float, default=1.0,
@@ -125,8 +117,6 @@ def parse_arguments() -> argparse.Namespace:
                         help='rows that it holds and that are not measured now stay in it')
     parser.add_argument('--reference', action='store_true',
                         help=f'write these rows into {REFERENCE.relative_to(ROOT)}')
-    parser.add_argument('--adopt', type=Path, metavar='FILE',
-                        help='measure nothing: the rows of these results become the reference')
     parser.add_argument('--compare', type=Path, default=REFERENCE, metavar='FILE',
                         help='another reference')
     arguments = parser.parse_args()
@@ -145,7 +135,6 @@ def read_rows(path: Path) -> dict[str, Row]:
 
 
 def write_rows(path: Path, rows: dict[str, Row]) -> None:
-    """Add rows to a file of results."""
     path.parent.mkdir(parents=True, exist_ok=True)
     kept = {**read_rows(path), **rows}
     ordered = {name: kept[name] for name in ROWS if name in kept}
@@ -177,23 +166,17 @@ def adopt(rows: dict[str, Row]) -> None:
 
 
 def main() -> int:
-    """Return 0 if nothing is worse than the reference, else 1."""
     arguments = parse_arguments()
-    if arguments.adopt is not None:
-        adopt(read_rows(arguments.adopt))
-        return 0
     before = read_rows(arguments.compare)
     rows: dict[str, Row] = {}
-    for name in ROWS:
-        if name not in arguments.only:
-            continue
+    for name in filter(arguments.only.__contains__, ROWS):
         begun, used = time.monotonic(), _processor_s()
         rows[name] = row = measure(name, arguments.scale, arguments.workers)
         # Shown, and kept, as soon as it is known: all of them take minutes.
         print(f'\n{name} ({time.monotonic() - begun:.0f} s, of processors '
               f'{_processor_s() - used:.0f} s)')
         known = before.get(name, {})
-        print(text_table(('figure', 'now', 'reference'), [
+        print(format_table(('figure', 'now', 'reference'), [
             [what, show(one), show(known[what]) if what in known else '–']
             for what, one in row.items()
         ]), flush=True)
@@ -202,7 +185,7 @@ def main() -> int:
     for what, found in (('better', better), ('worse', worse)):
         print(f'\n{what} than the reference: {len(found) or "nothing"}')
         if found:
-            print(text_table(COMPARED_HEADER, found))
+            print(format_table(COMPARED_HEADER, found))
     if arguments.reference:
         adopt(rows)
         return 0

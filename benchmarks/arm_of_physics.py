@@ -6,13 +6,10 @@ Everything is in one process and in simulated time: the arm of examples/arm_phys
 12 bits, commands in whole steps of them, which the driver reports. `identify` gets a record of each
 joint, moved as `identify --drive` moves it; one controller goes on with the files that it writes,
 on the trajectory of examples/joint_trajectory.py. --files: keeps those files, and uses those that
-are there. --write: makes the film of
-docs/arm.md, with libOSMesa (apt-get install libosmesa6) where there is no display.
+are there. --write: makes the film of docs/arm.md, with libOSMesa (apt-get install libosmesa6) where
+there is no display.
 """
 
-from __future__ import annotations
-
-import argparse
 import os
 import sys
 import tempfile
@@ -22,9 +19,10 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from PIL import Image
-from reporting import ROOT, text_table
+from reporting import ROOT, Array, parser_of, save_film
+
+from backlash_ros.tools.cli import format_table
 
 sys.path.append(str(ROOT / 'examples'))
 os.environ.setdefault('MUJOCO_GL', 'osmesa')  # mujoco reads it when it is imported
@@ -41,8 +39,6 @@ from backlash_ros.core.parameters import Parameters
 from backlash_ros.tools.config import read_configuration
 from backlash_ros.tools.figures import TIME_LABEL, curve, label
 from backlash_ros.tools.identify.command import main as identify
-
-Array = NDArray[np.float64]
 
 AMPLITUDE, PERIOD_S = 0.2, 8.0  # of a swing [rad]
 REACH, SPEED, DRIVE_S = 0.2, 0.08, 120.0  # for identify [rad], [rad/s]: no link coasts
@@ -107,10 +103,8 @@ def with_gaps(values: dict[str, object], share: float) -> dict[str, object]:
     """The same with constants: this share of what each joint loses for its gap."""
     fixed = {**values, 'estimator.law': 'fixed', 'estimates.load': False}
     for joint in JOINTS:
-        half = 0.5 * share * ArmPhysics().lost_motion(joint)
-        fixed |= {f'{joint.name}.estimator.initial.c_r': half,
-                  f'{joint.name}.estimator.initial.c_l': -half,
-                  f'{joint.name}.estimator.law': 'fixed'}
+        own, half = f'{joint.name}.estimator', 0.5 * share * ArmPhysics().lost_motion(joint)
+        fixed |= {f'{own}.law': 'fixed', f'{own}.initial.c_r': half, f'{own}.initial.c_l': -half}
     return fixed
 
 
@@ -121,8 +115,7 @@ def move(p: Parameters, passes: int) -> Motion:
     before = known_before if p.estimates.load else first_guess
     loops = JointLoops(
         p, v.update, lambda name: Driver(lambda: now_ns),
-        {name: before(p.of_joint(name)) for name in NAMES}, SampleCounter(period_s), dict(v),
-    )
+        {name: before(p.of_joint(name)) for name in NAMES}, SampleCounter(period_s), dict(v))
     references, positions, gaps, poses = [], [], [], []
     for k in range(round(passes * PERIOD_S / period_s)):
         now_ns = round((1.0 + k * period_s) * 1e9)
@@ -130,25 +123,21 @@ def move(p: Parameters, passes: int) -> Motion:
         positions.append(arm.links)
         poses.append(arm.data.qpos.copy())
         loops.take_references(dict(zip(NAMES, references[-1], strict=True)))
-        loops.answer({
-            name: Output(y, now_ns, now_ns, now_ns, k, numbered=False)
-            for name, y in zip(NAMES, arm.encoders(), strict=True)
-        })
-        estimates = [loop.estimate for loop in loops.by_name.values()]
-        gaps.append([one.c_r - one.c_l for one in estimates])
-        for loop in loops.by_name.values():
-            loop.core.refine()
+        loops.answer({name: Output(y, now_ns, now_ns, now_ns, k, numbered=False)
+                      for name, y in zip(NAMES, arm.encoders(), strict=True)})
+        each = list(loops.by_name.values())
+        gaps.append([loop.estimate.c_r - loop.estimate.c_l for loop in each])
         goals = [in_steps(v[name]) for name in NAMES]
-        for name, goal in zip(NAMES, goals, strict=True):
-            loops.by_name[name].take_applied(goal, now_ns + round(period_s * 1e9))
+        for loop, goal in zip(each, goals, strict=True):
+            loop.core.refine()
+            loop.take_applied(goal, now_ns + round(period_s * 1e9))
         arm.move_to(goals)
         arm.advance(period_s)
     delays = [loop.core.structure.delay for loop in loops.by_name.values()]
     late = np.maximum(np.arange(len(positions))[:, None] - delays, 0)
     wanted, where = np.take_along_axis(np.array(references), late, 0), np.array(positions)
-    tip = np.array([
-        np.linalg.norm(arm.tip_at(a) - arm.tip_at(b)) for a, b in zip(where, wanted, strict=True)
-    ])
+    tip = np.array([np.linalg.norm(arm.tip_at(a) - arm.tip_at(b))
+                    for a, b in zip(where, wanted, strict=True)])
     return Motion(where - wanted, tip, np.array(gaps), np.array(poses))
 
 
@@ -158,7 +147,6 @@ def in_steps(v: float) -> float:
 
 
 def rms(values: Array) -> Array:
-    """Root of the mean square over time."""
     return np.sqrt(np.mean(values**2, axis=0))
 
 
@@ -192,16 +180,11 @@ def film(without: Motion, learned: Motion, pass_of: int) -> None:
             canvas = FigureCanvasAgg(figure)
             canvas.draw()
             frames.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert('RGB'))
-    palette = frames[0].quantize(COLOURS)
-    pictures = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
-    pictures[0].save(FILM, save_all=True, append_images=pictures[1:], loop=0, optimize=True,
-                     duration=round(1e3 * FRAME_S))
+    save_film(FILM, frames, frames[0].quantize(COLOURS), FRAME_S, FRAME_S)
 
 
 def main() -> None:
-    """Print what each joint and the tip come to."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument('--files', type=Path)
     parser.add_argument('--passes', type=int, default=2)
     parser.add_argument('--write', action='store_true')
@@ -215,10 +198,8 @@ def main() -> None:
         values = identified(folder)
         without, known, learned = (
             move(Parameters(each), options.passes)
-            for each in (with_gaps(values, 0.0), with_gaps(values, 1.0), values)
-        )
-    period_s = Parameters(values).sample_period
-    pass_of = round(PERIOD_S / period_s)
+            for each in (with_gaps(values, 0.0), with_gaps(values, 1.0), values))
+    pass_of = round(PERIOD_S / Parameters(values).sample_period)
     print(table(without, known, learned, pass_of))
     if options.write:
         film(without, learned, pass_of)
@@ -231,7 +212,7 @@ def table(without: Motion, known: Motion, learned: Motion, pass_of: int) -> str:
     """
     passes = [slice(k, k + pass_of) for k in range(0, len(learned.tip), pass_of)]
     judged = [without.tip[passes[-1]], known.tip[passes[-1]], *(learned.tip[p] for p in passes)]
-    rows = [['tip [mm]', *(f'{1e3 * rms(tip):.2f}' for tip in judged)]]
+    rows = [['tip [mm]', *(f'{1e3 * rms(tip):.2f}' for tip in judged), *[''] * (1 + len(passes))]]
     for i, joint in enumerate(JOINTS):
         judged = [without.errors[passes[-1], i], known.errors[passes[-1], i],
                   *(learned.errors[p, i] for p in passes)]
@@ -239,11 +220,10 @@ def table(without: Motion, known: Motion, learned: Motion, pass_of: int) -> str:
         gaps = learned.gaps[[0, *(p.stop - 1 for p in passes)], i] / lost
         rows.append([f'{joint.name} [mrad]', *(f'{1e3 * rms(error):.2f}' for error in judged),
                      *(f'{gap:.3f}' for gap in gaps)])
-    numbers = range(1, len(passes) + 1)
-    header = ('RMS error', 'gaps 0', 'gaps known', *(f'pass {n}' for n in numbers),
-              'gap identified', *(f'after pass {n}' for n in numbers))
-    rows[0] += [''] * (len(header) - len(rows[0]))
-    return text_table(header, rows)
+    names = [f'pass {n}' for n in range(1, len(passes) + 1)]
+    header = ('RMS error', 'gaps 0', 'gaps known', *names, 'gap identified',
+              *(f'after {name}' for name in names))
+    return format_table(header, rows)
 
 
 if __name__ == '__main__':

@@ -8,16 +8,11 @@ Each sequence is a loop of a random plant, law, structure, limits and noise, in 
 core, the bookkeeping of samples and commands, and what the node decides around them; no middleware.
 """
 
-from __future__ import annotations
-
-import argparse
 import json
 import os
-import re
 import sys
 import time
 import warnings
-from collections import Counter
 from contextlib import nullcontext
 from multiprocessing import Pool
 from pathlib import Path
@@ -29,13 +24,12 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 sys.path.insert(1, str(Path(__file__).resolve().parents[1]))
 
 from fault_loop.fault_sequences import KINDS, Sequence
-from fault_loop.random_loop import PERIOD_S
-from reporting import ROOT, markdown_table, processors, text_table
+from fault_loop.fault_world import PERIOD_S
+from reporting import ROOT, markdown_table, parser_of, processors, write_between
+
+from backlash_ros.tools.cli import format_table
 
 DOCUMENT = ROOT / 'docs' / 'faults.md'
-MARK = re.compile(
-    r'(<!-- campaign: made by benchmarks/faults\.py -->\n).*?(<!-- end -->)', re.DOTALL
-)
 SEQUENCES, FIRST_SEED = 20_000, 1
 SHOWN = 3  # findings of a kind in the report of one sequence
 
@@ -53,13 +47,11 @@ class Result(NamedTuple):
 
 def read_results(path: Path | None) -> list[Result]:
     """What a file of results holds, a line of JSON each; nothing where there is none yet."""
-    if path is None or not path.exists():
-        return []
-    return [Result(*json.loads(line)) for line in path.read_text(encoding='utf-8').splitlines()]
+    lines = path.read_text().splitlines() if path and path.exists() else []
+    return [Result(*json.loads(line)) for line in lines]
 
 
 def play(seed: int) -> Result:
-    """Play the sequence of a seed."""
     with warnings.catch_warnings():
         warnings.simplefilter('ignore')
         sequence = Sequence(seed)
@@ -74,7 +66,6 @@ def play(seed: int) -> Result:
 
 
 def show(seed: int) -> int:
-    """Print what happens in a sequence, and what was found."""
     for kind, texts in Sequence(seed, print).run().items():
         for text in texts[:SHOWN]:
             print(f'{kind}: {text}')
@@ -85,36 +76,23 @@ def show(seed: int) -> int:
 
 def rows_of(results: list[Result]) -> list[list[str]]:
     """A line for each kind: how many sequences, and their seeds."""
-    rows = []
-    for kind, what in KINDS.items():
-        seeds = [str(result.seed) for result in results if kind in result.found]
-        rows.append([what, str(len(seeds)), ', '.join(seeds)])
-    return rows
+    seeds = {kind: [str(one.seed) for one in results if kind in one.found] for kind in KINDS}
+    return [[what, str(len(seeds[kind])), ', '.join(seeds[kind])] for kind, what in KINDS.items()]
 
 
 def summary(results: list[Result], first_seed: int) -> str:
-    """What was played, in a sentence."""
     hours = sum(result.samples for result in results) * PERIOD_S / 3600.0
-    claimed = sum(result.claimed for result in results)
     return (
         f'{len(results)} sequences from seed {first_seed} on, {hours:.1f} h of simulated time, '
-        f'{sum(result.commands for result in results)} commands; in {claimed} of them a law with '
-        'deviations said *tracking*.'
+        f'{sum(result.commands for result in results)} commands; in '
+        f'{sum(result.claimed for result in results)} of them a law with deviations said '
+        '*tracking*.'
     )
 
 
-def write_document(results: list[Result], first_seed: int) -> None:
-    """Write the table between its marks."""
-    text = DOCUMENT.read_text(encoding='utf-8')
-    table = markdown_table(('found', 'sequences', 'seeds'), rows_of(results))
-    made = f'{summary(results, first_seed)}\n\n{table}\n'
-    DOCUMENT.write_text(MARK.sub(lambda mark: f'{mark[1]}{made}{mark[2]}', text), encoding='utf-8')
-
-
-def parse_arguments() -> argparse.Namespace:
-    """Options of the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main() -> int:
+    """Return 0 if no command has broken a limit and nothing ran away."""
+    parser = parser_of(__doc__)
     parser.add_argument('--sequences', type=int, default=SEQUENCES, metavar='N')
     parser.add_argument('--first-seed', type=int, default=FIRST_SEED, metavar='S')
     parser.add_argument('--seed', type=int, metavar='K', help='show what happens in this one')
@@ -125,12 +103,7 @@ def parse_arguments() -> argparse.Namespace:
                         help='append what comes out; what it holds already is not played again')
     parser.add_argument('--write', action='store_true',
                         help=f'write the table into {DOCUMENT.relative_to(ROOT)}')
-    return parser.parse_args()
-
-
-def main() -> int:
-    """Return 0 if no command has broken a limit and nothing ran away."""
-    arguments = parse_arguments()
+    arguments = parser.parse_args()
     if arguments.seed is not None:
         return show(arguments.seed)
     first = arguments.first_seed
@@ -150,12 +123,12 @@ def main() -> int:
             if time.monotonic() > deadline:
                 pool.terminate()
                 break
-    print(summary(results, first))
-    print(text_table(('found', 'sequences', 'seeds'), rows_of(results)))
+    said, table = summary(results, first), (('found', 'sequences', 'seeds'), rows_of(results))
+    print(f'{said}\n{format_table(*table)}')
     if arguments.write:
-        write_document(results, first)
-    count = Counter(kind for result in results for kind in result.found)
-    return int(any(count[kind] for kind in ('outside', 'too_fast', 'unbounded', 'broken')))
+        write_between(DOCUMENT, 'campaign', f'{said}\n\n{markdown_table(*table)}')
+    found = {kind for result in results for kind in result.found}
+    return int(bool(found & {'outside', 'too_fast', 'unbounded', 'broken'}))
 
 
 if __name__ == '__main__':

@@ -9,9 +9,6 @@ Processor time and memory are those of all processes of the controllers, workers
 backlash is known; ratios of them say more than the figures of a busy machine.
 """
 
-from __future__ import annotations
-
-import argparse
 import sys
 import time
 from collections.abc import Callable, Iterable
@@ -21,16 +18,17 @@ from math import sin
 from pathlib import Path
 
 import numpy as np
+import psutil
 from builtin_interfaces.msg import Time
 from real_time.costs import processor_s, resident_mb
-from real_time.measuring_node import MeasuringNode
-from real_time.node_processes import node_command, processes, wait_for_event
-from reporting import text_table
+from real_time.measuring import MeasuringNode, node_command, processes, wait_for_event
+from reporting import parser_of
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, Header
 
 from backlash_ros.core.assembly import build_plant
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.tools.cli import format_table
 
 JOINTS = tuple(f'joint_{i}' for i in range(1, 7))
 WARM_UP_S = 6.0  # acquisition is not counted
@@ -151,16 +149,11 @@ def measure(together: bool, law: str, rate: float, seconds: float) -> list[str]:
     echo = [sys.executable, str(Path(__file__).parent / 'real_time' / 'echo_node.py')]
     begin = time.perf_counter()
     with processes({**controllers, 'echo': echo}) as (supervisor, domain):
-        waited = set(controllers)
-        while waited:
-            wait_for_event(
-                supervisor, lambda kind, who: kind == 'ready' and waited.discard(who) is None
-            )
+        wait_for_event(supervisor, 'ready', *controllers)
         start_up = time.perf_counter() - begin
         pids = [child.process.pid for child in supervisor.children if child.name != 'echo']
         with closing(Driver(domain, together, rate)) as driver:
-            if not driver.wait_for(driver.all_listen, MEETING_S):
-                raise RuntimeError(f'not all controllers listen within {MEETING_S:g} s')
+            driver.wait_for(driver.all_listen, MEETING_S, 'controllers that listen')
             warm_up = round(rate * WARM_UP_S)
             for k in range(warm_up):
                 driver.sample(k)
@@ -183,11 +176,8 @@ def measure(together: bool, law: str, rate: float, seconds: float) -> list[str]:
 
 def family(pids: Iterable[int]) -> list[int]:
     """These processes and all that they have started."""
-    found = list(pids)
-    for pid in found:
-        for task in Path(f'/proc/{pid}/task').iterdir():
-            found += map(int, (task / 'children').read_text().split())
-    return found
+    each = [psutil.Process(pid) for pid in pids]
+    return [one.pid for first in each for one in (first, *first.children(recursive=True))]
 
 
 def used_s(pids: Iterable[int]) -> float:
@@ -197,15 +187,14 @@ def used_s(pids: Iterable[int]) -> float:
 
 def main() -> None:
     """Print a table of both."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument('--law', default='moving_horizon')
     parser.add_argument('--rate', type=float, default=100.0, help='[Hz]')
     parser.add_argument('--seconds', type=float, default=20.0)
     options = parser.parse_args()
     header = ('', 'ready [s]', 'processor [%]', 'memory [MB]', 'p50 [ms]', 'p99 [ms]',
               'p50 / echo', 'p99 / echo', 'max [ms]', 'late', 'late echo')
-    print(text_table(header, [
+    print(format_table(header, [
         measure(together, options.law, options.rate, options.seconds) for together in (True, False)
     ]))
 

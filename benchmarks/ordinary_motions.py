@@ -8,8 +8,6 @@ Some of them, three seeds:    ... --cases 'sine|moves' exact --seeds 3 --by moti
 Drawn from all that is usual: ... --random 40 --first-seed 7 --samples 20000
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os
@@ -25,16 +23,14 @@ from pathlib import Path
 os.environ.setdefault('OMP_NUM_THREADS', '1')
 
 import numpy as np
-from cases.geared_motor import load_model, motor, random_backlash
-from cases.reference_loop import NINE_DIGITS, loop_on
-from contract.figures import Figure, by_group, figure, rms, share, upper
+from cases.loops import NINE_DIGITS, load_model, loop_on, motor, random_backlash
+from contract.figures import Array, Figure, by_group, figure, rms, share, upper
 from contract.judged import FAR, judged
 from numpy.typing import NDArray
-from reporting import ROOT, parallel, text_table
+from reporting import ROOT, parallel
 
 from backlash_ros.core import Status
-
-Array = NDArray[np.float64]
+from backlash_ros.tools.cli import format_table
 
 AMPLITUDE = 0.5  # of y_m [rad]
 FIVE_PERIODS = 10  # reversals
@@ -64,7 +60,6 @@ class Periodic:
 
     @property
     def seconds(self) -> float:
-        """How long it takes."""
         return max(5.3 * 2.0 * pi / self.omega, LEAST_S)
 
     def __call__(self, rng: np.random.Generator, period_s: float, lost_motion: float) -> Array:
@@ -316,7 +311,6 @@ def reversals_of(y_m: Array) -> NDArray[np.int_]:
 
 
 def contract_cases(scale: float) -> list[Case]:
-    """All cases, once at scale 1."""
     return list(all_cases(range(FIRST_SEED, FIRST_SEED + max(round(scale), 1))))
 
 
@@ -339,7 +333,6 @@ def contract_figures(results: Sequence[Result]) -> dict[str, Figure]:
 
 
 def figures_of(of: Sequence[Result]) -> dict[str, Figure]:
-    """Figures of runs that are alike."""
     return {
         'as due': share([r.good for r in of], 'more'),
         'learned': share([r.learned is not None for r in of], 'more'),
@@ -365,7 +358,6 @@ def row(name: str, results: Sequence[Result]) -> list[str]:
 
 
 def main() -> int:
-    """Return 0 if every run is as due, else 1."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--cases', nargs='+', default=[], metavar='REGEX',
@@ -398,7 +390,7 @@ def main() -> int:
     groups: dict[str, list[Result]] = {}
     for case, result in zip(cases, results, strict=True):
         groups.setdefault(label(case), []).append(result)
-    print(text_table(HEADER, [row(*group) for group in [*groups.items(), ('all', results)]]))
+    print(format_table(HEADER, [row(*group) for group in [*groups.items(), ('all', results)]]))
     for result in results:
         if result.faults:
             print(f'    {result.motion}; {result.plant}; {result.rate:g} Hz, seed {result.seed}: '

@@ -3,94 +3,35 @@
 `make bench` runs everything; `make bench ARGS='--only step'` a part of it.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import sys
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from typing import NamedTuple
 
 # Before numpy is imported: the matrices are tiny, threads would only disturb the loop.
 os.environ.setdefault('OMP_NUM_THREADS', '1')
 
-from cases.geared_motor import motor
-from real_time.costs import COST_HEADER, COST_RATES_HZ, measure_costs
-from real_time.loop_latency import (
-    BLOCK,
-    LATENCY_HEADER,
-    RATES_HZ,
-    latency_checks,
-    lockstep_speed,
-    measure_latency,
-)
-from real_time.soak import soak_checks
-from real_time.step_times import LAWS, STEP_HEADER, law_times, step_checks, step_rows
-from reporting import CHECK_HEADER, ROOT, Check, machine, markdown_table, text_table
+from cases.loops import motor
+from real_time.costs import COST_HEADER, measure_costs, soak_checks
+from real_time.loop_latency import BLOCK, LATENCY_HEADER, lockstep_speed, measure_latencies
+from real_time.step_times import LAWS, STEP_HEADER, measure_steps
+from reporting import CHECK_HEADER, ROOT, Check, Measured, machine, markdown_table
 
 from backlash_ros.core import Parameters, build_closed_loop
+from backlash_ros.tools.cli import format_table
 
 DOCUMENT = ROOT / 'docs' / 'results' / 'performance.md'
 DURATION_S = 20.0
-LATENCY_LOOPS = (('moving_horizon', 'proportional'), ('moving_horizon', 'tracking'),
-                 ('lms', 'proportional'))
 ACQUIRED, SIMULATED_SAMPLES = 3000, 12000
 
 
-@dataclass
-class Section:
-    """A table with what it shows, and the bounds it is held to."""
-
-    title: str
-    explanation: str
-    header: tuple[str, ...]
-    rows: list[list[str]] = field(default_factory=list)
-    checks: list[Check] = field(default_factory=list)
+def measure_lockstep(_: float) -> Measured:
+    return [[law, f'{lockstep_speed(law):.0f}'] for law in ('moving_horizon', 'lms')], []
 
 
-def measure_steps(_: float) -> Section:
-    """Time of one controller step."""
-    times = law_times()
-    return Section(
-        'Time of a controller step',
-        'One whole controller step beside one predict + update of a KalmanFilter of filterpy with '
-        'six states, taking turns in the same loop, once the backlash is known. What the command '
-        'need not wait for comes after it.',
-        STEP_HEADER, step_rows(times), step_checks(times),
-    )
-
-
-def measure_latencies(duration_s: float) -> Section:
-    """Latency of the controller process."""
-    section = Section(
-        'Latency from y to v',
-        'The real controller process beside a bare rclpy node that publishes what it gets, in '
-        f'alternating blocks of {BLOCK} samples, as seen by the driver that asks both.',
-        ('loop', *LATENCY_HEADER),
-    )
-    for law, structure in LATENCY_LOOPS:
-        for rate in RATES_HZ:
-            name = f'{law}, {structure}'
-            found = measure_latency(rate, law, duration_s, {'structure': structure})
-            section.rows += [[name, *row] for row in found.rows]
-            section.checks += latency_checks(found, name)
-            if found.unanswered:
-                print(f'{name}, {rate:g} Hz: {found.unanswered} samples without an answer')
-    return section
-
-
-def measure_lockstep(_: float) -> Section:
-    """Speed of lockstep."""
-    return Section(
-        'Lockstep', 'Plant, controller and reference as processes over DDS, as fast as they go.',
-        ('law', 'samples/s'),
-        [[law, f'{lockstep_speed(law):.0f}'] for law in ('moving_horizon', 'lms')],
-    )
-
-
-def measure_simulation(_: float) -> Section:
-    """Speed of the loop in one process."""
+def measure_simulation(_: float) -> Measured:
     noisy = {'output_noise_std': 1e-3}
     loops: dict[str, Mapping[str, object]] = {
         **{f'the example of the paper, {law}': {**noisy, 'estimator.law': law} for law in LAWS},
@@ -99,13 +40,7 @@ def measure_simulation(_: float) -> Section:
         'geared motor, tracking': {**motor(), 'structure': 'tracking'},
         'geared motor, proportional': {**motor(), 'structure': 'proportional'},
     }
-    return Section(
-        'Simulation',
-        'The loop in one process, on one processor. The search for the backlash and the first fits '
-        'of a growing record fall into the first samples.',
-        ('loop', f'first {ACQUIRED} samples, samples/s', 'the others, samples/s'),
-        [[name, *simulation_speeds(values)] for name, values in loops.items()],
-    )
+    return [[name, *simulation_speeds(values)] for name, values in loops.items()], []
 
 
 def simulation_speeds(values: Mapping[str, object]) -> list[str]:
@@ -123,55 +58,64 @@ def simulation_speeds(values: Mapping[str, object]) -> list[str]:
             f'{(SIMULATED_SAMPLES - ACQUIRED) / (end - acquired):.0f}']
 
 
-def measure_cost(duration_s: float) -> Section:
-    """What the processes of a loop cost."""
-    section = Section(
+class Part(NamedTuple):
+    """A table with what it shows. measure: its rows, and bounds, for a duration [s]."""
+
+    title: str
+    explanation: str
+    header: tuple[str, ...]
+    measure: Callable[[float], Measured]
+
+
+PARTS = {
+    'step': Part(
+        'Time of a controller step',
+        'One whole controller step beside one predict + update of a KalmanFilter of filterpy with '
+        'six states, taking turns in the same loop, once the backlash is known. What the command '
+        'need not wait for comes after it.', STEP_HEADER, measure_steps),
+    'latency': Part(
+        'Latency from y to v',
+        'The real controller process beside a bare rclpy node that publishes what it gets, in '
+        f'alternating blocks of {BLOCK} samples, as seen by the driver that asks both.',
+        LATENCY_HEADER, measure_latencies),
+    'costs': Part(
         'What it costs',
         'The default controller and `reference` as processes, beside a bare rclpy node that '
         'publishes every number it gets, at the same rate; once the backlash is known. Times are '
         'those of processors, of all threads; `its fits`: of the process that makes them.',
-        COST_HEADER,
-    )
-    for rate in COST_RATES_HZ:
-        rows, checks = measure_costs(rate, duration_s)
-        section.rows += rows
-        section.checks += checks
-    return section
-
-
-def measure_soak(duration_s: float) -> Section:
-    """Samples that are lost at 1 kHz, and what the controller keeps."""
-    return Section(
+        COST_HEADER, measure_costs),
+    'lockstep': Part(
+        'Lockstep', 'Plant, controller and reference as processes over DDS, as fast as they go.',
+        ('law', 'samples/s'), measure_lockstep),
+    'simulate': Part(
+        'Simulation',
+        'The loop in one process, on one processor. The search for the backlash and the first fits '
+        'of a growing record fall into the first samples.',
+        ('loop', f'first {ACQUIRED} samples, samples/s', 'the others, samples/s'),
+        measure_simulation),
+    'soak': Part(
         'At 1 kHz', 'Plant, reference and controller as processes in real time.', CHECK_HEADER,
-        checks=soak_checks(3.0 * duration_s),
-    )
-
-
-PARTS: dict[str, Callable[[float], Section]] = {
-    'step': measure_steps, 'latency': measure_latencies, 'costs': measure_cost,
-    'lockstep': measure_lockstep,
-    'simulate': measure_simulation, 'soak': measure_soak,
+        lambda duration_s: ([], soak_checks(3.0 * duration_s))),
 }
 
 
-def write_document(sections: list[Section]) -> None:
-    """Write the results as Markdown."""
+def write_document(tables: Mapping[str, list[list[str]]], checks: list[Check]) -> None:
     paragraphs = [
         '# Performance: what was measured',
         f"Written by `make bench ARGS='--write'` on {machine()}. Ratios carry over to other "
         'machines, the times themselves do not.',
-        '## Bounds and verdicts',
-        markdown_table(CHECK_HEADER, [check.row for s in sections for check in s.checks]),
+        '## Bounds and verdicts', markdown_table(CHECK_HEADER, [check.row for check in checks]),
     ]
-    for section in sections:
-        if section.rows:
-            paragraphs += [f'## {section.title}', section.explanation,
-                           markdown_table(section.header, section.rows)]
+    for name, rows in tables.items():
+        if rows:
+            part = PARTS[name]
+            paragraphs += [f'## {part.title}', part.explanation, markdown_table(part.header, rows)]
     DOCUMENT.write_text('\n\n'.join(paragraphs) + '\n')
+    print(f'wrote {DOCUMENT.relative_to(ROOT)}')
 
 
-def parse_arguments() -> argparse.Namespace:
-    """Options of the command line."""
+def main() -> int:
+    """Return 0 if every bound holds, else 1."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--only', nargs='+', metavar='PART', default=list(PARTS), choices=PARTS,
                         help=f'parts to measure, of {", ".join(PARTS)}')
@@ -184,26 +128,19 @@ def parse_arguments() -> argparse.Namespace:
         parser.error(f'--duration {arguments.duration:g} must be > 0')
     if arguments.write and set(arguments.only) != set(PARTS):
         parser.error('--write needs all parts: leave out --only')
-    return arguments
-
-
-def main() -> int:
-    """Return 0 if every bound holds, else 1."""
-    arguments = parse_arguments()
     print(machine())
-    sections: list[Section] = []
-    for part in arguments.only:
-        section = PARTS[part](arguments.duration)
+    tables: dict[str, list[list[str]]] = {}
+    checks: list[Check] = []
+    for name in arguments.only:
+        part = PARTS[name]
+        tables[name], further = part.measure(arguments.duration)
+        checks += further
         # Shown as soon as it is known: all of them take minutes.
-        print(f'\n{section.title}')
-        print(text_table(section.header, section.rows), flush=True)
-        sections.append(section)
-    checks = [check for section in sections for check in section.checks]
+        print(f'\n{part.title}\n{format_table(part.header, tables[name])}', flush=True)
     if checks:
-        print('\n' + text_table(CHECK_HEADER, [check.row for check in checks]))
+        print('\n' + format_table(CHECK_HEADER, [check.row for check in checks]))
     if arguments.write:
-        write_document(sections)
-        print(f'wrote {DOCUMENT.relative_to(ROOT)}')
+        write_document(tables, checks)
     return 0 if all(check.holds for check in checks) else 1
 
 

@@ -10,16 +10,13 @@ taken by something else. Nothing may be an error then. Last, in simulated time, 
 to 9 % slow, for --minutes each: their rate is named, and nothing else.
 """
 
-from __future__ import annotations
-
-import argparse
 import os
 import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
-from itertools import pairwise
+from itertools import pairwise, product
 from math import inf
 from typing import NamedTuple
 
@@ -27,14 +24,14 @@ from typing import NamedTuple
 os.environ.setdefault('OMP_NUM_THREADS', '1')
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from fault_loop.sound_driver import blamed
-from real_time.measuring_node import MeasuringNode
-from real_time.node_processes import DEADLINE_S, node_command, processes_in
-from reporting import CHECK_HEADER, ROOT, Check, machine, processors, text_table
+from fault_loop.fault_controller import blamed
+from real_time.measuring import DEADLINE_S, MeasuringNode, node_command, processes_in
+from reporting import CHECK_HEADER, ROOT, Check, machine, parser_of, processors
 
 from backlash_ros import topics
 from backlash_ros.tools.bringup.environment import free_domain
 from backlash_ros.tools.bringup.supervisor import Child
+from backlash_ros.tools.cli import format_table
 
 BOUND_S, LONGEST_S = 3.0, 15.0  # in which a line is to be there, and that it is waited for
 SOUND_S = 3.0  # of the loop before a mistake that is made while it runs
@@ -55,8 +52,7 @@ begun = []
 signal.signal(signal.SIGUSR1, lambda *_: begun.append(True))
 read, write = motor_driver.read_motor_position, motor_driver.write_motor_position
 if fault == 'rate':
-    motor_driver.motor = motor_driver.SimulatedMotor(0.02)
-    motor_driver.SAMPLE_PERIOD_S = 0.02
+    motor_driver.motor, motor_driver.SAMPLE_PERIOD_S = motor_driver.SimulatedMotor(0.02), 0.02
 if fault == 'slow':
     motor_driver.SAMPLE_PERIOD_S *= 1.06
 if fault == 'offset':
@@ -111,11 +107,9 @@ class Scene(MeasuringNode):
         return self._stack.enter_context(processes_in(self._domain, {name: command})).children[0]
 
     def lines(self) -> list[str]:
-        """What stands in the terminal so far."""
         return self.controller.log.read_text().splitlines()
 
     def spin(self, seconds: float) -> None:
-        """Listen for a moment."""
         if self.stalled:
             self.controller.process.send_signal(signal.SIGSTOP)
             time.sleep(STALL_S)
@@ -123,7 +117,6 @@ class Scene(MeasuringNode):
         super().spin(seconds)
 
     def go_on(self, seconds: float) -> None:
-        """Listen for so long."""
         deadline = time.monotonic() + seconds
         self.wait_for(lambda: time.monotonic() > deadline, inf)
 
@@ -179,27 +172,25 @@ SOUND: dict[str, tuple[str, tuple[str, ...], int]] = {
 
 def check_mistake(name: str) -> Check:
     """Make a mistake and look for the line that names it."""
-    mistake = MISTAKES[name]
-    with scene(mistake.fault) as (on, driver):
-        if mistake.made is not None:
+    words, fault, made = MISTAKES[name]
+    with scene(fault) as (on, driver):
+        if made is not None:
             on.go_on(SOUND_S)
-            mistake.made(on, driver)
+            made(on, driver)
         begin, before = time.monotonic(), len(on.lines())
         after_s = {'terminal': inf, '/diagnostics': inf}
 
         def named() -> bool:
-            there = {
-                'terminal': any(mistake.words in line for line in on.lines()[before:]),
-                '/diagnostics': any(
-                    at > begin and mistake.words in status.message for at, status in on.said),
-            }
-            now_s = time.monotonic() - begin
-            after_s.update({place: min(after_s[place], now_s) for place in there if there[place]})
+            said = {'terminal': on.lines()[before:],
+                    '/diagnostics': [status.message for at, status in on.said if at > begin]}
+            for place, texts in said.items():
+                if any(words in text for text in texts):
+                    after_s[place] = min(after_s[place], time.monotonic() - begin)
             return max(after_s.values()) < inf
 
         on.wait_for(named, LONGEST_S)
         lines = on.lines()[before:]
-    found = [line for line in lines if mistake.words in line][:1] or lines
+    found = [line for line in lines if words in line][:1] or lines
     print('\n  '.join([f'{name}:', *found]), flush=True)
     return Check(name, f'<= {BOUND_S:g} s',
                  ', '.join(f'{place} {s:.2f} s' for place, s in after_s.items()),
@@ -214,30 +205,24 @@ def check_sound(name: str) -> Check:
     print('\n  '.join([f'{name}:', *lines]), flush=True)
     errors = levels.count(DiagnosticStatus.ERROR)
     changes = sum(a != b for a, b in pairwise(levels))
-    return Check(f'{name}, for {SOUND_FOR_S:g} s', 'no ERROR',
-                 f'{errors} of {len(levels)} are ERROR, {changes} changes of the level',
-                 errors == 0)
+    said = f'{errors} of {len(levels)} are ERROR, {changes} changes of the level'
+    return Check(f'{name}, for {SOUND_FOR_S:g} s', 'no ERROR', said, errors == 0)
 
 
 def check_slow(minutes: float) -> Iterator[Check]:
     """Whether no healthy part is blamed though a driver does not keep its rate."""
-    for hz in (50.0, 100.0, 200.0, 500.0):
-        for slow in (0.0, 0.005, 0.03, 0.09):
-            _, kinds = blamed(hz, slow, 0.05, 60.0 * minutes, {
-                'output_noise_std': 1e-3, 'estimator.output_noise_std': 1e-3,
-                'plant.uncertainty': 0.2, 'frequency': 0.126 * hz,
-                'structure': 'tracking' if slow == 0.03 else 'proportional',
-            })
-            yield Check(
-                f'{hz:g} Hz, {slow:.1%} slow, for {minutes:g} min', 'rate' if slow else 'nothing',
-                ', '.join(kinds) or 'nothing', set(kinds) == ({'rate'} if slow else set()),
-            )
+    for hz, slow in product((50.0, 100.0, 200.0, 500.0), (0.0, 0.005, 0.03, 0.09)):
+        _, kinds = blamed(hz, slow, 0.05, 60.0 * minutes, {
+            'output_noise_std': 1e-3, 'estimator.output_noise_std': 1e-3,
+            'plant.uncertainty': 0.2, 'frequency': 0.126 * hz,
+            'structure': 'tracking' if slow == 0.03 else 'proportional'})
+        yield Check(f'{hz:g} Hz, {slow:.1%} slow, for {minutes:g} min',
+                    'rate' if slow else 'nothing', ', '.join(kinds) or 'nothing',
+                    set(kinds) == ({'rate'} if slow else set()))
 
 
 def main() -> int:
-    """Return 0 if every bound holds, else 1."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument('--case', choices=[*MISTAKES, *SOUND, SLOW], action='append',
                         help='instead of all; may be repeated')
     parser.add_argument('--minutes', type=float, default=0.5, help='of each slow driver')
@@ -246,9 +231,8 @@ def main() -> int:
     print(machine())
     checks = [check_mistake(name) for name in MISTAKES if name in wanted]
     checks += [check_sound(name) for name in SOUND if name in wanted]
-    if SLOW in wanted:
-        checks += check_slow(arguments.minutes)
-    print('\n' + text_table(CHECK_HEADER, [check.row for check in checks]))
+    checks += check_slow(arguments.minutes) if SLOW in wanted else []
+    print('\n' + format_table(CHECK_HEADER, [check.row for check in checks]))
     return 0 if all(check.holds for check in checks) else 1
 
 

@@ -9,8 +9,6 @@ p = m v, and v moves evenly within a sample. In contact, without dry friction, x
 1 / (1 + 2 d s/w + s^2/w^2) with w^2 = k/J and 2 d w = b/J.
 """
 
-from __future__ import annotations
-
 from math import copysign, pi
 
 from backlash_ros.core.plant.backlash import Backlash
@@ -38,7 +36,6 @@ class CoastingLoad:
         self._v = self._x = self._speed = 0.0
 
     def measure(self) -> float:
-        """y(k) as the sensor shows it."""
         return self._quantum * round(self._x / self._quantum) if self._quantum else self._x
 
     def step(self, v: float) -> float:

@@ -5,8 +5,6 @@ either of the two waits for the processor before it goes on, so that outputs are
 commands come after the sample that they were for.
 """
 
-from __future__ import annotations
-
 import sys
 from collections import deque
 from math import inf
@@ -58,15 +56,11 @@ class HeldUpProcesses:
     """One run of both. load: how often they wait, 0 for an idle machine; reports: of v applied."""
 
     def __init__(self, p: Parameters, load: float, seed: int, reports: bool) -> None:
-        self.period = p.sample_period
+        self.period, self._reports = p.sample_period, reports
         self._load, self._random = load, Random(seed)
-        self._reports = reports
-        self._now = 0.0
-        self._sent = 0.0  # the newest command
-        self.loop = ControlLoop(
-            p, self._send, Driver(lambda: _ns(self._now)), None,
-            SampleCounter(self.period, False),
-        )
+        self._now = self._sent = 0.0  # sent: the newest command
+        self.loop = ControlLoop(p, self._send, Driver(lambda: _ns(self._now)), None,
+                                SampleCounter(self.period, False))
         self._reference = build_reference(p)
         # Of the driver: when it samples next, the number of the sample, and a command on its way.
         self._due, self._number = self.period, 0
@@ -77,18 +71,15 @@ class HeldUpProcesses:
         self._free = 0.0  # when it has done its last turn
 
     def run(self, seconds: float) -> list[Heard]:
-        """Go on for so long and tell of every answer."""
         heard = []
         with patch.object(simulated_motor, 'time', self):
             motor = simulated_motor.SimulatedMotor(self.period)
-            while min(self._driver_at, self._controller_at) < seconds:
-                if self._driver_at <= self._controller_at:
-                    self._now = self._driver_at
+            while (now := min(self._driver_at, self._controller_at)) < seconds:
+                driver_first, self._now = self._driver_at <= self._controller_at, now
+                if driver_first:
                     self._drive(motor)
-                else:
-                    self._now = self._controller_at
-                    if self._control():
-                        heard.append(Heard(self._now, self.loop.estimate))
+                elif self._control():
+                    heard.append(Heard(self._now, self.loop.estimate))
         return heard
 
     def monotonic(self) -> float:

@@ -1,18 +1,15 @@
 """Random actuators, motions and noises for the benchmark of the identification."""
 
-from __future__ import annotations
-
 from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from reporting import Array
 from scipy.signal import cont2discrete, lfilter
 
 from backlash_ros.core.identification.motion import strokes
 from backlash_ros.core.plant.backlash import play
-
-Array = NDArray[np.float64]
 
 SECONDS = 10.0
 PERIODS_S = (0.004, 0.005, 0.01)
@@ -39,7 +36,6 @@ class Case(NamedTuple):
 
     @property
     def c_l(self) -> float:
-        """Left crossing."""
         return self.c_r - self.gap
 
     def response(self, frequencies: Array) -> NDArray[np.complex128]:
@@ -109,12 +105,8 @@ def _multisine(rng: np.random.Generator, reach: float, period: float, count: int
     """What a user might have recorded: four sines."""
     t = period * np.arange(count)
     first, phases = rng.uniform(0.4, 1.2), rng.uniform(0.0, 2.0 * np.pi, 4)
-    v = np.sum([
-        size * np.sin(2.0 * np.pi * first * harmonic * t + phase)
-        for size, harmonic, phase in zip(
-            (1.0, 0.6, 0.4, 0.25), (1.0, 2.3, 3.7, 5.9), phases, strict=True
-        )
-    ], axis=0)
+    v = sum(size * np.sin(2.0 * np.pi * first * harmonic * t + phase) for size, harmonic, phase
+            in zip((1.0, 0.6, 0.4, 0.25), (1.0, 2.3, 3.7, 5.9), phases, strict=True))
     return np.asarray(reach * v / np.abs(v).max())
 
 

@@ -1,21 +1,85 @@
-"""Random plants, gaps and references for the estimation and tracking benchmarks."""
+"""Random plants, gaps and references, and the Cramér–Rao bound for the v that was applied."""
 
-from __future__ import annotations
-
-from collections.abc import Mapping
+from collections.abc import Callable
 from math import ceil
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from reporting import Array
+from scipy import linalg, signal
 from scipy.signal import lfilter
 
 from backlash_ros.core.assembly import build_true_model
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
-from cases.cramer_rao import cramer_rao
 
-Array = NDArray[np.float64]
+SINGULAR = 1e-13  # of the largest singular value: a direction that y does not show
+
+
+def engaged_regressors(v: Array, m: float, c_r: float, c_l: float, u: float) -> Array:
+    """phi(k) of u(k) = phi' (m, m c_r, m c_l, u_0), shape (N, 4); u is held at first."""
+    rows = np.zeros((len(v), 4))
+    row = np.array([0.0, 0.0, 0.0, 1.0])
+    for k, value in enumerate(v):
+        if u <= m * (value - c_r):
+            u, row = m * (value - c_r), np.array([value, -1.0, 0.0, 0.0])
+        elif u >= m * (value - c_l):
+            u, row = m * (value - c_l), np.array([value, 0.0, -1.0, 0.0])
+        rows[k] = row
+    return rows
+
+
+def cramer_rao(
+    v: Array, numerator: Array, denominator: Array, truth: tuple[float, float, float],
+    noise_std: float, received: NDArray[np.bool_] | None = None, u0: float = 0.0,
+    effects: Callable[[Array], Array] | None = None,
+) -> Array:
+    """Smallest standard deviations of (m, c_r, c_l) from y(0..N), v(0..N-1) applied, shape (3,).
+
+    received: which of y(0..N) arrived. Unknown are x(0), theta and the u held at the start.
+    effects: what a standard deviation of each of K other unknowns does to y, shape (N+1, K), from
+    u(0..N); these are known beforehand to be normal around their true values (Van Trees).
+    inf where y does not show a parameter.
+    """
+    m, c_r, c_l = truth
+    phi = np.vstack([engaged_regressors(v, m, c_r, c_l, u0), np.zeros((1, 4))])
+    b = np.concatenate([np.zeros(len(denominator) - len(numerator)), numerator])
+    forced = [signal.lfilter(b, denominator, phi[:, i]) for i in range(4)]
+    impulses = np.eye(len(denominator) - 1, len(phi))
+    free = [signal.lfilter(np.ones(1), denominator, impulse) for impulse in impulses]
+    held = [forced[3]] if np.any(forced[3]) else []
+    sensitivity = np.column_stack([*forced[:3], *free, *held])
+    if effects is not None:
+        sensitivity = np.hstack([sensitivity, effects(phi @ [m, m * c_r, m * c_l, u0])])
+    if received is not None:
+        sensitivity = sensitivity[received]
+    if effects is not None:
+        prior = noise_std * np.eye(sensitivity.shape[1])[3 + len(free) + len(held):]
+        sensitivity = np.vstack([sensitivity, prior])
+    jacobian = np.array([[1.0, 0, 0], [-c_r / m, 1 / m, 0], [-c_l / m, 0, 1 / m]])
+    root, hidden = _theta_root(sensitivity)
+    # Each column of root is one direction of the data: the norms are standard deviations.
+    bound = noise_std * np.linalg.norm(jacobian @ root, axis=1)
+    bound[np.abs(jacobian) @ hidden > 0.0] = np.inf
+    return np.asarray(bound)
+
+
+def _theta_root(sensitivity: Array) -> tuple[Array, Array]:
+    """Return L with L L' = the first 3 x 3 block of the inverse information for unit noise.
+
+    The second value says how much of each theta lies in directions that y does not show.
+    """
+    size = np.linalg.norm(sensitivity, axis=0)
+    size[size == 0.0] = 1.0
+    r = linalg.qr(sensitivity / size, mode='r')[0][: len(size)]
+    _, singular, rows = linalg.svd(r)
+    lost = singular <= SINGULAR * singular[0]
+    root = rows[~lost, :3].T / singular[~lost] / size[:3, None]
+    hidden = np.abs(rows[lost, :3]).max(axis=0, initial=0.0)
+    hidden[hidden < np.sqrt(SINGULAR)] = 0.0
+    return np.asarray(root), np.asarray(hidden)
+
 
 PERIODS = 3
 NOISE_TO_SWING = 0.002  # noise on y over its swing, at most
@@ -48,28 +112,22 @@ def random_plant(rng: np.random.Generator) -> tuple[Array, Array, str]:
             poles += [radius * np.exp(1j * angle), radius * np.exp(-1j * angle)]
         else:
             poles.append(float(np.exp(-np.exp(rng.uniform(np.log(0.01), np.log(0.5))))))
-    zeros: list[float] = []
-    outside = False
-    for _ in range(int(rng.integers(0, order))):
-        if rng.random() < 0.4:
-            zeros.append(float(rng.choice([-1.0, 1.0]) * rng.uniform(1.15, 4.0)))
-            outside = True
-        else:
-            zeros.append(float(rng.uniform(-0.9, 0.8)))
+    zeros = [float(rng.choice([-1.0, 1.0]) * rng.uniform(1.15, 4.0)) if rng.random() < 0.4
+             else float(rng.uniform(-0.9, 0.8)) for _ in range(int(rng.integers(0, order)))]
     numerator = np.atleast_1d(np.real(np.poly(zeros))) * 10.0 ** rng.uniform(-4.0, 0.0)
-    denominator = np.real(np.poly(poles))
-    kind = f'order {order}{" integrating" if integrating else ""}{" nmp" if outside else ""}'
-    return numerator, denominator, kind
+    kind = f'order {order}{" integrating" if integrating else ""}'
+    kind += ' nmp' if any(abs(zero) > 1.0 for zero in zeros) else ''
+    return numerator, np.real(np.poly(poles)), kind
 
 
-def random_case(seed: int, **fixed: object) -> Case:
-    """The case of a seed; `fixed` overrides parameters.
+def random_case(seed: int) -> Case:
+    """The case of a seed.
 
     A case asks what the motion tells. Its noise is 0.2 % of the swing of y, or less where the
     Cramér-Rao bound of the loop that knows the backlash is beyond 0.4 % for m, c_r or c_l after the
     three periods, as for a small c_r beside a large c_l. No estimator has a part in that.
     """
-    return _with_noise(_without_noise(seed), TOLD, fixed)
+    return _with_noise(_without_noise(seed), TOLD)
 
 
 def uncertain_case(seed: int) -> Case:
@@ -90,16 +148,15 @@ def uncertain_case(seed: int) -> Case:
         'truth.numerator': numerator.tolist(), 'truth.denominator': denominator.tolist(),
         'plant.uncertainty': UNCERTAINTY,
     })
-    return _with_noise(case._replace(parameters=p), TOLD_UNCERTAIN, {})
+    return _with_noise(case._replace(parameters=p), TOLD_UNCERTAIN)
 
 
 def _without_noise(seed: int, below_corners: bool = False) -> Case:
     """below_corners: whether the reference is no faster than the slowest pole."""
     rng = np.random.default_rng([seed, 20])
     numerator, denominator, kind = random_plant(rng)
-    m = float(np.exp(rng.uniform(np.log(0.3), np.log(3.0))))
-    c_r = float(np.exp(rng.uniform(np.log(0.2), np.log(8.0))))
-    c_l = -float(np.exp(rng.uniform(np.log(0.2), np.log(8.0))))
+    m, c_r, c_l = (sign * float(np.exp(rng.uniform(np.log(low), np.log(high))))
+                   for sign, low, high in ((1, 0.3, 3.0), (1, 0.2, 8.0), (-1, 0.2, 8.0)))
     factors = 10.0 ** rng.uniform(-1.0, 1.0, 3)
     first = (m * factors[0], c_r * factors[1], c_l * factors[2])
     samples_per_period = int(rng.integers(40, 200))
@@ -132,10 +189,10 @@ def _slowest(denominator: Array) -> float:
     return float(-1.0 / np.log(max(sizes))) if sizes else 0.0
 
 
-def _with_noise(case: Case, told: float, fixed: Mapping[str, object]) -> Case:
+def _with_noise(case: Case, told: float) -> Case:
     noise = _noise(case, told)
-    changes = {'output_noise_std': noise, 'estimator.output_noise_std': noise, **fixed}
-    return case._replace(parameters=case.parameters.replaced(changes))
+    return case._replace(parameters=case.parameters.replaced(
+        {'output_noise_std': noise, 'estimator.output_noise_std': noise}))
 
 
 def altered(numerator: Array, denominator: Array, logs: Array) -> tuple[Array, Array]:
@@ -173,8 +230,7 @@ def bound_of(p: Parameters, v: Array) -> Array:
         steps = SPREAD * STEP * np.eye(2 * model.order)
         there, back = (
             np.array([_response(*altered(numerator, denominator, s), u) for s in sign * steps])
-            for sign in (1.0, -1.0)
-        )
+            for sign in (1.0, -1.0))
         return np.asarray((there - back).T / (2.0 * STEP))
 
     bound = cramer_rao(

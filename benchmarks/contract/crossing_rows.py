@@ -6,26 +6,21 @@ noise, one at the start, and one more in 10 s. Random cases: geared motor and th
 known or ten times what was told; noise on y_m; constants exact, 3 % off, or learned.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from math import pi
 from typing import Any, NamedTuple
 
 import numpy as np
-from cases.geared_motor import load_model, motor
-from cases.reference_loop import loop_on, without_sensor
-from numpy.typing import NDArray
+from cases.loops import load_model, loop_on, motor, without_sensor
 from scipy.signal import sawtooth
 
 from backlash_ros.core import Parameters, Status
+from backlash_ros.core.assembly import build_model
 from backlash_ros.core.plant.simulated_plant import altered_plant
 from backlash_ros.core.plant.transfer_function import TransferFunction
 from backlash_ros.core.simulation.metrics import turns
 from backlash_ros.core.simulation.run_record import RunRecord
-from contract.figures import Figure, by_group, figure, rms, share, upper
-
-Array = NDArray[np.float64]
+from contract.figures import Array, Figure, by_group, figure, rms, share, upper
 
 LONGEST_S, MOST_SAMPLES = 40.0, 5000
 LEAST_TURN = 0.01  # share of m gap by which u* turns at least
@@ -35,17 +30,15 @@ CONSTANTS = ('exact', '3 % off', 'learned')
 
 class Crossing(NamedTuple):
     """One loop: crossings of the gap by v over those allowed, and RMS of y - y_m over that of a
-    loop without backlash in the same noise. drawn: what the case is.
+    loop without backlash in the same noise.
     """
 
     group: str
     crossings: float
     error: float
-    drawn: dict[str, Any]
 
 
-def crossing_jobs(scale: float, first_seed: int = 0) -> list[int]:
-    """Seeds of the cases."""
+def crossings_jobs(scale: float, first_seed: int = 0) -> list[int]:
     return list(range(first_seed, first_seed + max(round(48 * scale), 24)))
 
 
@@ -62,29 +55,25 @@ def moves_with_rests(
     return np.concatenate(places)
 
 
-def case_of(seed: int) -> tuple[dict[str, Any], Array, Array, dict[str, Any]]:
-    """Parameters, the reference, as it is heard, and what was drawn."""
+def case_of(seed: int) -> tuple[dict[str, Any], Array, Array, tuple[str, str]]:
+    """Parameters, the reference, as it is heard, the motion and what is known of the constants."""
     rng = np.random.default_rng([seed, 37])
     plant, motion = ('motor', 'paper')[seed % 2], MOTIONS[seed // 2 % 4]
     constants = CONSTANTS[seed // 8 % 3]
     period_s = float(1.0 / np.exp(rng.uniform(np.log(50.0), np.log(1000.0))))
     omega = float(np.exp(rng.uniform(np.log(0.4), np.log(10.0))))
-    values: dict[str, Any] = {**motor()} if plant == 'motor' else {}
-    if plant == 'motor':
-        model = TransferFunction(*load_model(period_s))
-    else:
-        paper = Parameters({}).plant
-        model = altered_plant(
-            TransferFunction(paper.numerator, paper.denominator), period_s / 0.01)
-    values |= {'sample_period': period_s, 'plant.numerator': model.numerator.tolist()[1:],
-               'plant.denominator': model.denominator.tolist(), 'structure': 'tracking',
-               'seed': seed, 'amplitude': 1.0, 'bias': 0.0}
+    model = TransferFunction(*load_model(period_s)) if plant == 'motor' \
+        else altered_plant(build_model(Parameters({})), period_s / 0.01)
+    values: dict[str, Any] = {
+        **(motor() if plant == 'motor' else {}), 'sample_period': period_s,
+        'plant.numerator': model.numerator.tolist()[1:],
+        'plant.denominator': model.denominator.tolist(), 'structure': 'tracking',
+        'seed': seed, 'amplitude': 1.0, 'bias': 0.0}
     hidden = Parameters(values).backlash
     gain = float(abs(model.response(np.array([np.exp(1j * omega * period_s)]))[0]))
     of_gap = gain * hidden.m * (hidden.c_r - hidden.c_l)
     amplitude = of_gap * float(np.exp(rng.uniform(np.log(0.7), np.log(8.0))))
-    if plant == 'motor':
-        amplitude = min(amplitude, 0.7)
+    amplitude = min(amplitude, 0.7 if plant == 'motor' else np.inf)
     noise = (0.0, 1e-3, 1e-2, 0.1)[int(rng.integers(4))] * float(rng.uniform(0.5, 1.0)) * of_gap
     wrongly_told = bool(rng.random() < 0.25)
     heard_noise = (0.0, 2e-4)[int(rng.integers(2))] * amplitude
@@ -97,24 +86,18 @@ def case_of(seed: int) -> tuple[dict[str, Any], Array, Array, dict[str, Any]]:
                    'estimator.initial.c_l': off * hidden.c_l}
     count = round(min(LONGEST_S, max(12.0, 5.3 * 2.0 * pi / omega)) / period_s)
     t = period_s * np.arange(min(count, MOST_SAMPLES))
-    shape: Array = np.sin(omega * t)
-    if motion == 'moves':
-        shape = moves_with_rests(rng, period_s, omega, float(t[-1]) + period_s)[:len(t)]
-    elif motion == 'steps':
-        shape = np.sign(np.sin(omega * t + 1e-9))
-    elif motion == 'triangle':
-        shape = sawtooth(omega * t + 0.5 * pi, 0.5)
-    wanted = amplitude * shape
+    wanted = amplitude * {
+        'sine': lambda: np.sin(omega * t), 'triangle': lambda: sawtooth(omega * t + 0.5 * pi, 0.5),
+        'steps': lambda: np.sign(np.sin(omega * t + 1e-9)),
+        'moves': lambda: moves_with_rests(rng, period_s, omega, float(t[-1]) + period_s)[:len(t)],
+    }[motion]()
     heard = wanted + heard_noise * rng.standard_normal(len(t))
-    drawn = {'plant': plant, 'motion': motion, 'constants': constants, 'rate': 1.0 / period_s,
-             'omega': omega, 'amplitude': amplitude / of_gap, 'noise': noise / of_gap,
-             'wrongly_told': wrongly_told, 'heard': heard_noise / amplitude}
-    return values, wanted, heard, drawn
+    return values, wanted, heard, (motion, constants)
 
 
-def run_crossing(seed: int) -> Crossing:
+def run_crossings(seed: int) -> Crossing:
     """The loop, and those without backlash."""
-    values, wanted, heard, drawn = case_of(seed)
+    values, wanted, heard, (motion, constants) = case_of(seed)
     p = Parameters(values)
     gapless = {**values, 'estimator.law': 'fixed', 'fixed.doubt': 0.0,
                'estimator.initial.m': p.backlash.m,
@@ -126,7 +109,7 @@ def run_crossing(seed: int) -> Crossing:
     run, beside = loop.run(len(heard)), loop_on(gapless, heard).run(len(heard))
     begin = delay = loop.controller.structure.delay
     count = len(wanted)
-    if drawn['constants'] == 'learned':
+    if constants == 'learned':
         known = np.flatnonzero(run.column('status') == int(Status.TRACKING))
         begin += (known[0] if len(known) else count // 2) + 100
     begin = min(begin, 3 * count // 4)
@@ -137,12 +120,11 @@ def run_crossing(seed: int) -> Crossing:
     def error(of: RunRecord) -> float:
         return rms(without_sensor(p, of)[begin:] - wanted[begin - delay:count - delay])
 
-    return Crossing(drawn['motion'], turns(run.column('v')[begin:], 0.5 * gap) / allowed,
-                    error(run) / error(beside), drawn)
+    return Crossing(motion, turns(run.column('v')[begin:], 0.5 * gap) / allowed,
+                    error(run) / error(beside))
 
 
-def crossing_figures(found: Sequence[Crossing]) -> dict[str, Figure]:
-    """Figures of every motion."""
+def crossings_figures(found: Sequence[Crossing]) -> dict[str, Figure]:
     return by_group(found, lambda of: {
         'more crossings than allowed': share([one.crossings > 1.0 for one in of]),
         'crossings / allowed, median': figure([one.crossings for one in of]),

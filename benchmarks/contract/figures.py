@@ -1,16 +1,13 @@
 """Figures with their scatter, and what is worse or better than in a reference."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from math import hypot, log, sqrt
 from typing import Any, Literal, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from reporting import Array
 
-Array = NDArray[np.float64]
 Run = TypeVar('Run')
 Better = Literal['less', 'more', 'one']  # one: the nearer to 1 on a logarithmic scale
 
@@ -30,23 +27,21 @@ class Figure:
     runs: int
     better: Better = 'less'
 
-    def beyond(self, reference: Figure) -> float:
+    def beyond(self, reference: 'Figure') -> float:
         """By how many standard deviations it is worse, negative where it is better."""
-        (bad, scatter), (bad_before, scatter_before) = map(_badness, (self, reference))
-        difference = bad - bad_before
-        return difference / max(hypot(scatter, scatter_before), 1e-12) if difference else 0.0
+        (bad, scatter), (before, scatter_before) = self.badness, reference.badness
+        return (bad - before) / max(hypot(scatter, scatter_before), 1e-12)
 
-
-def _badness(one: Figure) -> tuple[float, float]:
-    """What is better where it is less, and its standard deviation."""
-    if one.better == 'one':
-        value = max(one.value, 1e-9)
-        return abs(log(value)), one.scatter / value
-    return one.value if one.better == 'less' else -one.value, one.scatter
+    @property
+    def badness(self) -> tuple[float, float]:
+        """What is better where it is less, and its standard deviation."""
+        if self.better == 'one':
+            value = max(self.value, 1e-9)
+            return abs(log(value)), self.scatter / value
+        return self.value if self.better == 'less' else -self.value, self.scatter
 
 
 def rms(values: Array) -> float:
-    """Root of the mean square."""
     return float(np.sqrt(np.mean(values**2)))
 
 
@@ -73,13 +68,10 @@ def figure(
 
 def share(values: Sequence[float | bool | None], better: Better = 'less') -> Figure:
     """Mean of shares, of which none or all in a few runs is no certainty."""
-    plain = figure(
-        [None if value is None else float(value) for value in values], np.mean, better)
-    if not plain.runs:
-        return plain
+    plain = figure(values, np.mean, better)
     p = (plain.value * plain.runs + 1.0) / (plain.runs + 2.0)
-    return Figure(plain.value, max(plain.scatter, sqrt(p * (1.0 - p) / plain.runs)), plain.runs,
-                  better)
+    least = sqrt(p * (1.0 - p) / plain.runs) if plain.runs else 0.0
+    return replace(plain, scatter=max(plain.scatter, least))
 
 
 def upper(values: Array) -> float:
@@ -94,7 +86,6 @@ def by_group(
     runs: Sequence[Run], figures: Callable[[Sequence[Run]], Row],
     group: Callable[[Run], str] = lambda run: run.group,  # type: ignore[attr-defined]
 ) -> dict[str, Figure]:
-    """The figures of each group of runs, named after it."""
     found: dict[str, list[Run]] = {}
     for run in runs:
         found.setdefault(group(run), []).append(run)
@@ -103,7 +94,6 @@ def by_group(
 
 
 def as_json(rows: Mapping[str, Row]) -> dict[str, dict[str, dict[str, Any]]]:
-    """Rounded, for a file."""
     return {name: {
         what: {**asdict(one), 'value': float(f'{one.value:.5g}'),
                'scatter': float(f'{one.scatter:.3g}')} for what, one in row.items()
@@ -111,17 +101,16 @@ def as_json(rows: Mapping[str, Row]) -> dict[str, dict[str, dict[str, Any]]]:
 
 
 COMPARED_HEADER = ('row', 'figure', 'reference', 'now', 'deviations')
+Cells = list[list[str]]
 
 
-def compare(
-    rows: Mapping[str, Row], reference: Mapping[str, Row],
-) -> tuple[list[list[str]], list[list[str]]]:
+def compare(rows: Mapping[str, Row], reference: Mapping[str, Row]) -> tuple[Cells, Cells]:
     """Cells of what is worse, and of what is better, than in the reference, beyond the scatter.
 
     A figure that the reference has and a row does not is worse.
     """
-    worse: list[list[str]] = []
-    better: list[list[str]] = []
+    worse: Cells = []
+    better: Cells = []
     for name, row in rows.items():
         for what, before in reference.get(name, {}).items():
             now = row.get(what)
@@ -134,5 +123,4 @@ def compare(
 
 
 def show(one: Figure) -> str:
-    """A figure and its scatter as text."""
     return f'{one.value:.4g} ± {one.scatter:.2g}' if one.runs else '–'

@@ -5,23 +5,18 @@ but for: adaptive, nothing known of the backlash; without backlash, gap 0 and sl
 uncompensated, slope known and gap taken as 0.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from math import pi
 from typing import Any, NamedTuple
 
 import numpy as np
-from cases.geared_motor import motor
+from cases.loops import NINE_DIGITS, loop_on, motor, without_sensor
 from cases.random_cases import random_case
-from cases.reference_loop import NINE_DIGITS, loop_on, without_sensor
-from numpy.typing import NDArray
 
 from backlash_ros.core import Parameters, build_closed_loop
 from backlash_ros.core.simulation.metrics import gap_crossings_per_reversal
-from contract.figures import Figure, by_group, figure, rms, share, upper
+from contract.figures import Array, Figure, by_group, figure, rms, share, upper
 
-Array = NDArray[np.float64]
 Changes = dict[str, Any]
 
 SETTLED_S = 2.0  # from here on a loop counts as settled
@@ -92,7 +87,6 @@ def following_jobs(scale: float) -> list[Case]:
 
 
 def run_following(case: Case) -> Followed:
-    """Run the three loops."""
     known = {'estimator.law': 'fixed', 'estimator.initial.c_r': 0.0, 'estimator.initial.c_l': 0.0,
              'estimator.initial.m': Parameters(case.changes).backlash.m}
     try:
@@ -123,7 +117,6 @@ def _run(case: Case, change: Mapping[str, Any]) -> tuple[float, Any, Array]:
 
 
 def following_figures(found: Sequence[Followed]) -> dict[str, Figure]:
-    """Figures of every reference."""
     def of_group(of: Sequence[Followed]) -> dict[str, Figure]:
         over_gapless = [min(f.adaptive / max(f.gapless, 1e-12), 1e3) for f in of]
         return {

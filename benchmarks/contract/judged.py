@@ -1,28 +1,17 @@
 """How right a run was, and how honest about it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core import Status
-from contract.figures import Figure, figure, rms, share, upper
-
-Array = NDArray[np.float64]
+from backlash_ros.core.simulation.run_record import RunRecord
+from contract.figures import Array, Figure, figure, rms, share, upper
 
 FAR, BEYOND = 0.01, 5.0  # error in gaps, in published deviations, of a wrong estimate
 CAPPED = 10.0  # deviations: a change that is not noticed yet would outweigh everything
-
-
-class Record(Protocol):
-    """What the run of a closed loop returns."""
-
-    def column(self, name: str) -> Array:
-        """One signal, shape (N,)."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +35,6 @@ class Judged:
 
     @property
     def tracking(self) -> NDArray[np.bool_]:
-        """Whether each sample is *tracking*."""
         return self.status == Status.TRACKING
 
     def first_s(self) -> float:
@@ -80,7 +68,7 @@ class Judged:
         return ~(self.z.max(axis=1) <= BEYOND)
 
 
-def judged(run: Record, shift: float | Array = 0.0) -> Judged:
+def judged(run: RunRecord, shift: float | Array = 0.0) -> Judged:
     """Beside the true backlash of the run. shift: of both crossings by what is added to u."""
     gap = run.column('true_c_r') - run.column('true_c_l')
     off = np.abs(np.column_stack(
@@ -102,10 +90,8 @@ def figures_of(runs: Sequence[Judged | None], marks_s: Sequence[float]) -> dict[
         return [broken if run is None else value(run) for run in runs]
 
     return {
-        **{f'error at {mark:g} s, median [gap]': figure(of(lambda r, s=mark: r.at(s), 1e3))
-           for mark in marks_s},
-        **{f'error at {mark:g} s, 90 % [gap]': figure(of(lambda r, s=mark: r.at(s), 1e3), upper)
-           for mark in marks_s},
+        **{f'error at {mark:g} s, {name} [gap]': figure(of(lambda r, s=mark: r.at(s), 1e3), how)
+           for name, how in (('median', np.median), ('90 %', upper)) for mark in marks_s},
         'tracking': share(of(lambda r: float(r.tracking.mean()), 0.0), 'more'),
         'error / deviation, RMS': figure([r.rms for r in whole], rms, 'one'),
         'beyond five deviations': share([r.beyond for r in whole]),

@@ -1,7 +1,5 @@
 """Rows of simulated loops: what is learned beside the bound, and where the plant is not as told."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
@@ -9,16 +7,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from cases.coasting_load import CoastingLoad
-from cases.cramer_rao import cramer_rao
-from cases.geared_motor import motor, random_backlash
-from cases.random_cases import bound_of, random_case, uncertain_case
-from numpy.typing import NDArray
+from cases.loops import motor, random_backlash
+from cases.random_cases import bound_of, cramer_rao, random_case, uncertain_case
 
 from backlash_ros.core import Parameters, Status, build_closed_loop, build_plant
-from contract.figures import Figure, by_group, figure, rms, share, upper
+from contract.figures import Array, Figure, by_group, figure, rms, share, upper
 from contract.judged import Judged, figures_of, judged
 
-Array = NDArray[np.float64]
 Changes = dict[str, Any]
 
 PAPER: Changes = {'plant.uncertainty': 0.0}
@@ -41,7 +36,7 @@ class Outcome:
     """What came of a job. error, bound: of (m, c_r, c_l) at its marks, shape (marks, 3).
 
     follows: RMS of y minus the reference it is to follow, over that of the reference, in the last
-    half. moved: change of c_r and c_l while y_m rests at the end, in gaps.
+    half.
     """
 
     group: str
@@ -73,13 +68,10 @@ def run_job(job: Job) -> Outcome:
             run = loop.run(round(job.seconds / period) + 1)
     except BROKEN:
         return Outcome(job.group, None)
-    error, bound = _beside_bound(p, run, job.marks_s)
     rows = np.round(run.column('t') / period).astype(int)  # a lost y has none
     added = np.array(disturbance)[np.minimum(rows, len(disturbance) - 1)]
-    return Outcome(
-        job.group, judged(run, added / p.backlash.m),
-        error, bound, _follows(p, run),
-    )
+    return Outcome(job.group, judged(run, added / p.backlash.m),
+                   *_beside_bound(p, run, job.marks_s), _follows(p, run))
 
 
 def _follows(p: Parameters, run: Any) -> float:
@@ -97,15 +89,12 @@ def _beside_bound(p: Parameters, run: Any, marks_s: Sequence[float]) -> tuple[Ar
     errors, bounds = [], []
     for mark in (round(mark / period) for mark in marks_s):
         row = int(np.searchsorted(index, mark, side='right')) - 1
-        errors.append([run.column(n)[row] - x for n, x in zip(('m', 'c_r', 'c_l'), truth,
-                                                              strict=True)])
+        errors.append([run.column(name)[row] for name in ('m', 'c_r', 'c_l')] - np.array(truth))
         # A lost sample leaves the command before it in force.
         v = run.column('v')[np.searchsorted(index, np.arange(mark), side='right') - 1]
         bounds.append(cramer_rao(
-            v, np.array(p.plant.numerator),
-            np.array(p.plant.denominator), truth, p.output_noise_std,
-            np.isin(np.arange(mark + 1), index), p.backlash.initial_u,
-        ))
+            v, np.array(p.plant.numerator), np.array(p.plant.denominator), truth,
+            p.output_noise_std, np.isin(np.arange(mark + 1), index), p.backlash.initial_u))
     return np.array(errors).reshape(-1, 3), np.array(bounds).reshape(-1, 3)
 
 
@@ -115,12 +104,9 @@ BOUND_MARKS_S = (1.0, 2.0, 6.0)
 
 
 def bound_jobs(scale: float) -> list[Job]:
-    """Three levels of noise."""
-    return [
-        Job(f'noise {noise:g}', {**PAPER, 'output_noise_std': noise, 'seed': seed}, 6.0,
-            marks_s=BOUND_MARKS_S)
-        for noise in (1e-4, 1e-3, 1e-2) for seed in range(1, 1 + round(50 * scale))
-    ]
+    return [Job(f'noise {noise:g}', {**PAPER, 'output_noise_std': noise, 'seed': seed}, 6.0,
+                marks_s=BOUND_MARKS_S)
+            for noise in (1e-4, 1e-3, 1e-2) for seed in range(1, 1 + round(50 * scale))]
 
 
 def losses_jobs(scale: float) -> list[Job]:
@@ -184,11 +170,9 @@ def plants_jobs(structure: str, scale: float) -> list[Job]:
             for (motion, change), plant in product(OTHERWISE.items(), ('exact', 'ω × 1.2'))
         },
     }
-    return [
-        Job(group, {**motor(), **random_backlash(seed), **change, 'structure': structure,
-                    'seed': seed}, 10.0)
-        for group, plants in cases.items() for change in plants.values() for seed in seeds
-    ]
+    return [Job(group, {**motor(), **random_backlash(seed), **change, 'structure': structure,
+                        'seed': seed}, 10.0)
+            for group, plants in cases.items() for change in plants.values() for seed in seeds]
 
 
 def plants_figures(outcomes: Sequence[Outcome]) -> dict[str, Figure]:
@@ -215,14 +199,11 @@ class RandomOutcome(NamedTuple):
 
 
 def random_jobs(scale: float) -> list[tuple[str, int]]:
-    """Kinds and seeds."""
-    counts = dict(zip(RANDOM_KINDS, (60, 20, 60), strict=True))
-    return [(kind, seed) for kind, count in counts.items()
+    return [(kind, seed) for kind, count in zip(RANDOM_KINDS, (60, 20, 60), strict=True)
             for seed in range(1, 1 + round(scale * count))]
 
 
 def run_random(job: tuple[str, int]) -> RandomOutcome:
-    """One random case."""
     kind, seed = job
     case = random_case(seed) if kind != RANDOM_KINDS[2] else uncertain_case(seed)
     p = case.parameters
@@ -233,17 +214,13 @@ def run_random(job: tuple[str, int]) -> RandomOutcome:
         run = build_closed_loop(p).run(case.samples + 1)
     except BROKEN:
         return RandomOutcome(kind, 1e3, 1e3, None)
-    off = np.array([
-        abs(float(run.column(n)[-1] / run.column(f'true_{n}')[-1]) - 1.0)
-        for n in ('m', 'c_r', 'c_l')
-    ])
-    bound = bound_of(p, run.column('v')[:-1])
-    return RandomOutcome(
-        kind, min(float((off / bound).max()), 1e3), float(off.max()), judged(run))
+    off = np.array([abs(float(run.column(n)[-1] / run.column(f'true_{n}')[-1]) - 1.0)
+                    for n in ('m', 'c_r', 'c_l')])
+    over_bound = float((off / bound_of(p, run.column('v')[:-1])).max())
+    return RandomOutcome(kind, min(over_bound, 1e3), float(off.max()), judged(run))
 
 
 def random_figures(outcomes: Sequence[RandomOutcome]) -> dict[str, Figure]:
-    """Figures of each kind."""
     return by_group(outcomes, lambda of: {
         'error / bound, median': figure([r.over_bound for r in of]),
         'beyond 3 % of error': share([r.relative > 0.03 for r in of]),
@@ -304,11 +281,6 @@ def changes_figures(outcomes: Sequence[Outcome]) -> dict[str, Figure]:
 
 
 def learned_again_s(run: Judged) -> float:
-    """Time from the jump until *tracking* stays within 0.5 % of the gap; all that is left if not.
-
-    Stays: until the end.
-    """
-    after = run.t > JUMP_S
-    outside = after & ~((run.error <= 0.005) & (run.status == Status.TRACKING))
-    last = float(run.t[np.flatnonzero(outside)[-1]]) if outside.any() else JUMP_S
-    return last - JUMP_S
+    """Time from the jump until *tracking* stays within 0.5 % of the gap to the end, if ever."""
+    outside = (run.t > JUMP_S) & ~((run.error <= 0.005) & (run.status == Status.TRACKING))
+    return float(run.t[outside][-1]) - JUMP_S if outside.any() else 0.0

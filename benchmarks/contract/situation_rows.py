@@ -1,41 +1,27 @@
 """Rows of what is more than a loop: late commands, faults, identification, gears of physics."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json
 import tempfile
 from collections.abc import Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
-from cases.geared_motor import flat, motor
 from cases.held_up import HeldUpProcesses
 from cases.identification_cases import NO_PLAYS, Case, random_case, without_play
+from cases.loops import flat, motor
 from faults import Result
-from gears.gear_runs import (
-    PRESETS,
-    Gear,
-    close_loop,
-    gear_of,
-    limits_of,
-    lost_motion,
-    quasi_static,
-    record,
-    uncompensated,
-)
-from numpy.typing import NDArray
+from gears import gear_runs
+from gears.gear_runs import PRESETS, Gear, close_loop, gear_of
 
 from backlash_ros.core import Estimate, Parameters, Status, build_controller, fit_record
 from backlash_ros.core.plant.transfer_function import TransferFunction
 from backlash_ros.tools.identify.command import main as identify
-from contract.figures import Figure, by_group, figure, share, upper
-
-Array = NDArray[np.float64]
-
+from contract.figures import Array, Figure, by_group, figure, share, upper
 
 # Late commands: driver and controller held up by a busy machine, in simulated time.
 
@@ -52,13 +38,10 @@ class HeldUp(NamedTuple):
 
 
 def late_jobs(scale: float) -> list[tuple[float, str, int]]:
-    """Load, use of applied_control, seed."""
-    return [(load, use, seed) for load in (0.4, 1.0) for use in ('auto', 'false')
-            for seed in range(1, 1 + max(round(10 * scale), 1))]
+    return list(product((0.4, 1.0), ('auto', 'false'), range(1, 1 + max(round(10 * scale), 1))))
 
 
 def run_late(job: tuple[float, str, int]) -> HeldUp:
-    """One seed."""
     load, use, seed = job
     p = Parameters({**motor(), 'estimator.use_applied_control': use})
     heard = HeldUpProcesses(p, load, seed, reports=use != 'false').run(HELD_UP_S)
@@ -68,7 +51,6 @@ def run_late(job: tuple[float, str, int]) -> HeldUp:
 
 
 def late_figures(runs: Sequence[HeldUp]) -> dict[str, Figure]:
-    """Figures of each group."""
     return by_group(runs, lambda of: {
         f'error at {HELD_UP_S:g} s, median': figure([r.at_end for r in of]),
         f'error at {HELD_UP_S:g} s, 90 %': figure([r.at_end for r in of], upper),
@@ -84,7 +66,6 @@ FIRST_SEQUENCE = 101
 
 
 def faults_jobs(scale: float) -> list[int]:
-    """Seeds of benchmarks/faults.py."""
     return list(range(FIRST_SEQUENCE, FIRST_SEQUENCE + round(150 * scale)))
 
 
@@ -108,11 +89,6 @@ class Found(NamedTuple):
     json: Mapping[str, Any]
     parameters: Parameters | None
 
-    @property
-    def usable(self) -> bool:
-        """Whether it called the result of use."""
-        return bool(self.json.get('usable', False))
-
 
 def identified(t: Array, v: Array, y: Array, given: Mapping[str, Any] | None = None) -> Found:
     """Let `identify` read a CSV. given: parameters that it goes on from."""
@@ -128,12 +104,10 @@ def identified(t: Array, v: Array, y: Array, given: Mapping[str, Any] | None = N
         said = io.StringIO()
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
             identify(arguments)
-        if not (folder / 'identified.json').exists():
-            return Found({'usable': False}, None)
-        found, of_yaml = json.loads((folder / 'identified.json').read_text()), None
-        if (folder / 'identified.yaml').exists():
-            of_yaml = Parameters(flat(yaml.safe_load((folder / 'identified.yaml').read_text())))
-    return Found(found, of_yaml)
+        texts = {path.name: path.read_text() for path in folder.glob('identified.*')}
+    found = json.loads(texts.get('identified.json', '{"usable": false}'))
+    of_yaml = texts.get('identified.yaml')
+    return Found(found, None if of_yaml is None else Parameters(flat(yaml.safe_load(of_yaml))))
 
 
 class Identified(NamedTuple):
@@ -162,7 +136,6 @@ def identification_jobs(scale: float) -> list[tuple[str, int]]:
 
 
 def run_identification(job: tuple[str, int]) -> Identified:
-    """Identify one actuator."""
     group, seed = job
     if group == NONE:
         found = identified(*without_play(NO_PLAYS[seed % len(NO_PLAYS)], seed)).json
@@ -184,17 +157,14 @@ def run_identification(job: tuple[str, int]) -> Identified:
     else:
         truth |= {'c_r': case.c_r, 'c_l': case.c_l}
     found = identified(t, v, y).json
-    off = {name: _off(found.get(name), true) for name, true in truth.items()}
+    off = {name: abs(found[name] - true) if isinstance(found.get(name), float) else 1e3
+           for name, true in truth.items()}
     std = (found.get('std') or {}).get('gap') or 1e-12
     return Identified(
         group, bool(found.get('usable')), min(max(off.values()) / case.gap, 1e3),
         min(off['gap'] / std, 1e3), found.get('delay_samples') == delay,
         _fitted(case) if group == CLEAN else None,
     )
-
-
-def _off(found: Any, true: float) -> float:
-    return abs(found - true) if isinstance(found, float) else 1e3
 
 
 def _fitted(case: Case) -> tuple[float, float]:
@@ -205,7 +175,6 @@ def _fitted(case: Case) -> tuple[float, float]:
 
 
 def identification_figures(runs: Sequence[Identified]) -> dict[str, Figure]:
-    """What was promised, and what came out."""
     def of_group(of: Sequence[Identified]) -> dict[str, Figure]:
         if of[0].group == NONE:
             return {'a gap is promised': share([run.usable for run in of])}
@@ -251,27 +220,28 @@ class GearOutcome(NamedTuple):
 
 def gears_jobs(scale: float) -> list[str | tuple[float, float]]:
     """Presets, and cells of the map of inertia and bandwidth."""
-    return [*PRESETS, *((inertia, bandwidth) for inertia in INERTIAS for bandwidth in BANDWIDTHS)]
+    return [*PRESETS, *product(INERTIAS, BANDWIDTHS)]
 
 
-def run_gear(job: str | tuple[float, float]) -> list[GearOutcome]:
+def run_gears(job: str | tuple[float, float]) -> list[GearOutcome]:
     """Identify, and close the loop with what was found, for each motion."""
     if isinstance(job, str):
         gear, group, motions = PRESETS[job], 'presets', MOTIONS
-        lost = lost_motion(*quasi_static(gear)[::2])
+        lost = gear_runs.lost_motion(*gear_runs.quasi_static(gear)[::2])
     else:
         gear, group, motions = gear_of(*job), 'map', MOTIONS[:1]
         lost = gear.lost_motion
-    v, _, y = record(gear)
+    v, _, y = gear_runs.record(gear)
     found = identified(gear.sample_period * np.arange(len(v)), v, y, {
-        **limits_of(gear), 'estimator.use_applied_control': 'false'})
+        **gear_runs.limits_of(gear), 'estimator.use_applied_control': 'false'})
     return [_closed(gear, group, motion, found, lost) for motion in motions]
 
 
 def _closed(gear: Gear, group: str, motion: str, found: Found, lost: float) -> GearOutcome:
     off, p = abs(float(found.json.get('gap') or 0.0) / lost - 1.0), found.parameters
+    usable = bool(found.json['usable'])
     if p is None:
-        return GearOutcome(group, found.usable, off, None, None, 0.0, False)
+        return GearOutcome(group, usable, off, None, None, 0.0, False)
     std, initial = found.json['std'], p.estimator.initial
     estimate = Estimate(
         initial.m, initial.c_r, initial.c_l, p.proportional.f,
@@ -279,20 +249,19 @@ def _closed(gear: Gear, group: str, motion: str, found: Found, lost: float) -> G
     try:
         run = close_loop(gear, build_controller(p, estimate), motion)
     except (ArithmeticError, ValueError):
-        return GearOutcome(group, found.usable, off, 1e3, 0.0, 0.0, False)
+        return GearOutcome(group, usable, off, 1e3, 0.0, 0.0, False)
     removed = None
     if group == 'presets':
-        none = uncompensated(gear, p, motion).error
+        none = gear_runs.uncompensated(gear, p, motion).error
         removed = max((none - run.error) / none, -1.0)
     return GearOutcome(
-        group, found.usable, off, abs(float(run.gap[-1]) / lost - 1.0), removed,
+        group, usable, off, abs(float(run.gap[-1]) / lost - 1.0), removed,
         float(np.mean(run.status[run.first:] == Status.TRACKING)),
         run.said_tracking_off_by(lost) > OFF,
     )
 
 
 def gears_figures(gears: Sequence[Sequence[GearOutcome]]) -> dict[str, Figure]:
-    """Figures of presets and map."""
     runs = [run for gear in gears for run in gear]
     return by_group(runs, lambda of: {
         'called of use': share([r.usable for r in of], 'more'),

@@ -4,8 +4,6 @@ Times are in units of one predict + update of filterpy's KalmanFilter with six s
 the same loop, or of a bare echo node: so they carry over to other machines.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -13,11 +11,10 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from cases.geared_motor import motor
-from numpy.typing import NDArray
+from cases.loops import motor
 from real_time.loop_latency import measure_latency
 from real_time.step_times import Sampled, filter_timer
 from scipy.optimize import least_squares
@@ -25,9 +22,7 @@ from scipy.signal import lfilter
 
 from backlash_ros.core import Parameters, build_closed_loop
 from backlash_ros.core.plant.backlash import play
-from contract.figures import Figure, figure
-
-Array = NDArray[np.float64]
+from contract.figures import Array, Figure, figure
 
 LEAST_SCATTER = 0.05  # relative, of a time: what one run of a machine does not show
 QUANTILES = {'p50': 0.5, 'p99': 0.99}
@@ -36,10 +31,7 @@ LATENCY_S, RATE_HZ = 5.0, 1000.0
 SIMULATED = 8000
 
 
-class Times(NamedTuple):
-    """Ratios of one repetition, by figure."""
-
-    ratios: dict[str, float]
+Times = dict[str, float]  # ratios of one repetition, by figure
 
 
 def repeated(scale: float, names: Sequence[str], times: int) -> list[tuple[str, int]]:
@@ -48,12 +40,9 @@ def repeated(scale: float, names: Sequence[str], times: int) -> list[tuple[str, 
 
 
 def times_figures(found: Sequence[Times]) -> dict[str, Figure]:
-    """Medians over the repetitions."""
-    names = dict.fromkeys(name for one in found for name in one.ratios)
-    return {
-        name: figure([one.ratios[name] for one in found if name in one.ratios],
-                     least_scatter=LEAST_SCATTER) for name in names
-    }
+    names = dict.fromkeys(name for one in found for name in one)
+    return {name: figure([one.get(name) for one in found], least_scatter=LEAST_SCATTER)
+            for name in names}
 
 
 def step_jobs(scale: float) -> list[tuple[str, int]]:
@@ -67,11 +56,8 @@ def run_step(job: tuple[str, int]) -> Times:
     sampled = Sampled(Parameters({'structure': structure, 'output_noise_std': 1e-3,
                                   'seed': seed + 1}))
     timer = filter_timer()
-    rows = []
-    for _ in range(ACQUISITION + STEADY):
-        step = sampled.step()
-        rows.append((step, sampled.refined, timer()))
-    steps, refits, filters = np.array(rows).T
+    steps, refits, filters = np.array([
+        (sampled.step(), sampled.refined, timer()) for _ in range(ACQUISITION + STEADY)]).T
     unit = float(np.median(filters))
     found = {}
     for what, times in (('step', steps), ('refit', refits)):
@@ -80,7 +66,7 @@ def run_step(job: tuple[str, int]) -> Times:
             of, name = times[part] / unit, f'{what}, {structure}, {phase}'
             found |= {f'{name}, {word}': float(np.quantile(of, q)) for word, q in QUANTILES.items()}
             found[f'{name}, mean'] = float(of.mean())
-    return Times(found)
+    return found
 
 
 def latency_jobs(scale: float) -> list[tuple[str, int]]:
@@ -94,10 +80,8 @@ def run_latency(job: tuple[str, int]) -> Times:
     law = name if name == 'lms' else 'moving_horizon'
     structure = 'proportional' if name == 'lms' else name
     found = measure_latency(RATE_HZ, law, LATENCY_S, {'structure': structure})
-    return Times({
-        f'{law}, {structure}, {quantile} / echo': found.ratio(q)
-        for quantile, q in QUANTILES.items()
-    })
+    return {f'{law}, {structure}, {quantile} / echo': found.ratio(q)
+            for quantile, q in QUANTILES.items()}
 
 
 SIMULATIONS: dict[str, Callable[[], dict[str, Any]]] = {
@@ -111,7 +95,6 @@ SIMULATIONS: dict[str, Callable[[], dict[str, Any]]] = {
 
 
 def simulate_jobs(scale: float) -> list[tuple[str, int]]:
-    """Several loops."""
     return repeated(scale, tuple(SIMULATIONS), 4)
 
 
@@ -123,8 +106,8 @@ def run_simulate(job: tuple[str, int]) -> Times:
     unit = float(np.median([timer() for _ in range(2000)]))
     begun = time.process_time()
     loop.run(SIMULATED)
-    return Times({f'{name}: processor time of a sample':
-                  (time.process_time() - begun) / SIMULATED / unit})
+    return {f'{name}: processor time of a sample':
+            (time.process_time() - begun) / SIMULATED / unit}
 
 
 IDENTIFIED = {'4,000 samples': (4000, 0.005), '60 s at 1 kHz': (60_000, 0.001),
@@ -162,5 +145,4 @@ def run_identify(job: tuple[str, int]) -> Times:
         subprocess.run([sys.executable, '-m', 'backlash_ros.tools.identify', str(path), '--out',
                         folder], check=True, capture_output=True)
         spent = sum(os.times()[2:4]) - begun
-    return Times({f'identify, {name} [s]': spent, f'identify, {name} / given the gap':
-                  spent / floor})
+    return {f'identify, {name} [s]': spent, f'identify, {name} / given the gap': spent / floor}

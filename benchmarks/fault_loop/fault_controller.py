@@ -1,22 +1,22 @@
-"""The controller in the fault campaign: its loop with what the node does around it, without DDS.
+"""The controller in the fault campaign, and what it says of a driver with another rate."""
 
-What ControllerNode decides by wall clock and messages is decided here by simulated time: when the
-driver is silent, how a stall is caught up with.
-"""
-
-from __future__ import annotations
-
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Mapping
 from math import nan
+
+import numpy as np
 
 from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.control.limits import Limits
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.control_loop import Driver as Asked
+from backlash_ros.core.loop.diagnosis import Neighbours, figures_of_loop, findings_of
+from backlash_ros.core.loop.finding import Level
+from backlash_ros.core.loop.loop_statistics import Lately
 from backlash_ros.core.loop.sample_counter import SampleCounter, kept_outputs
 from backlash_ros.core.parameters import Parameters
-from fault_loop.fault_world import Driver
+from fault_loop.fault_world import Actuator, Driver, Sensor
 
 
 class Controller:
@@ -48,7 +48,6 @@ class Controller:
         self.loop = ControlLoop(self.p, self._send, asked, inherited, self._counter, v)
 
     def cycle(self, clean_up: bool) -> None:
-        """Deactivate, clean up and configure if wanted, and activate."""
         self.deactivate()
         if clean_up:
             self._configure(None, self.loop.v if self.loop.knows_v else None)
@@ -67,7 +66,6 @@ class Controller:
                 pass
 
     def take_up(self, p: Parameters) -> None:
-        """Use other live parameters."""
         self.p = p
         self.loop.take_up(p)
 
@@ -99,3 +97,36 @@ class Controller:
     def _send(self, v: float) -> None:
         self.sent(v, self.loop.core.limits)
         self.driver.actuator.v = v
+
+
+# Who is on the topics is known to a node alone.
+OF_TOPICS = ('waiting for output', 'unheard')
+
+
+def blamed(
+    hz: float, slow: float, jitter: float, seconds: float, values: Mapping[str, object],
+) -> tuple[list[str], Counter[str]]:
+    """Texts that came first, as warning or error, second by second, and how often each kind.
+
+    slow, jitter: as in Driver. The plant goes on in its own time: to a slow driver it is faster.
+    """
+    p = Parameters({'sample_period': 1.0 / hz, 'truth.scale_frequency': 1.0 + slow, **values})
+    rng = np.random.default_rng(1)
+    driver = Driver(p, rng, Actuator(), Sensor(rng, 10.0), False, slow=slow, jitter=jitter)
+    controller = Controller(p, driver, None, lambda v, limits: None, lambda step, renewed: None)
+    lately, texts, kinds = Lately(), [], Counter[str]()
+    for k in range(round(seconds * hz)):
+        driver.advance()
+        controller.run(driver.reference(driver.tick * p.sample_period))
+        if k % round(hz) == 0:
+            loop = controller.loop
+            said = [
+                finding for finding in findings_of(figures_of_loop(
+                    loop, p, loop.counter.sender.timing(), lately.gained(loop.counted, k / hz),
+                    Neighbours(),
+                ))
+                if finding.level > Level.OK and finding.kind not in OF_TOPICS
+            ]
+            texts += [finding.text for finding in said[:1]]
+            kinds.update(finding.kind for finding in said)
+    return texts, kinds

@@ -1,8 +1,7 @@
 """Random sequences of faults, and what must not happen in any of them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
+from contextlib import suppress
 from math import isfinite
 
 import numpy as np
@@ -18,10 +17,8 @@ from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.transfer_function import TransferFunction
 from fault_loop.fault_controller import Controller
-from fault_loop.fault_world import SENSOR_FAULTS, Actuator, Driver, Sensor
-from fault_loop.promised_bound import PromisedBound
-from fault_loop.random_loop import PERIOD_S, parameters_of
-from fault_loop.uninterrupted import Uninterrupted
+from fault_loop.fault_world import PERIOD_S, SENSOR_FAULTS, Actuator, Driver, Sensor, parameters_of
+from fault_loop.promises import PromisedBound, Uninterrupted
 
 SAMPLES = (300, 800)
 PAUSE = (15, 120)  # samples from one event to the next
@@ -61,16 +58,12 @@ class Sequence:
         self.claimed = False
         self._told = told
         while True:
-            try:
+            with suppress(ParameterError):  # of a plant that is refused
                 self.p, swing = parameters_of(rng)
                 break
-            except ParameterError:
-                continue  # a plant that is refused
         p = self.p
         self.actuator = Actuator()
-        self.driver = Driver(
-            p, rng, self.actuator, Sensor(rng, swing), reports=bool(rng.random() < 0.5)
-        )
+        self.driver = Driver(p, rng, self.actuator, Sensor(rng, swing), bool(rng.random() < 0.5))
         self.truth = _truth(p)
         self._foreign = False  # whether the loop began with what another plant has taught
         self._frozen: float | None = None  # y_m while the loop is interrupted
@@ -88,8 +81,7 @@ class Sequence:
         self._bound = PromisedBound(p)
         inherited = None
         if rng.random() < 0.2:
-            inherited = self._saved_elsewhere()
-            self._foreign = True
+            inherited, self._foreign = self._saved_elsewhere(), True
             told(f'begins with saved estimates of another plant: {inherited}')
         knows_v = rng.random() < 0.5
         self.controller = Controller(p, self.driver, inherited, self._sent, self._answered)
@@ -98,15 +90,15 @@ class Sequence:
         told(f'{p.estimator.law}, {p.structure}, truth {self.truth}')
 
     def run(self) -> dict[str, list[str]]:
-        """Play the sequence; what was found."""
         rng, driver = self.rng, self.driver
         self.samples = int(rng.integers(*SAMPLES))
         next_event = int(rng.integers(*PAUSE))
         for tick in range(1, self.samples + 1):
-            if tick in self._stops:
-                self._stops.pop(tick)()
+            self._stops.pop(tick, lambda: None)()
             if tick == next_event:
-                self._event(tick)
+                self._lately = str(rng.choice(EVENTS))
+                self._told(f'{tick}: {self._lately}')
+                EVENTS_BY_NAME[self._lately](self, tick)
                 next_event = tick + int(rng.integers(*PAUSE))
             driver.advance()
             y_m = driver.reference(tick * PERIOD_S)
@@ -114,22 +106,14 @@ class Sequence:
         self.found['unbounded'] += self._bound.exceeded()
         return self.found
 
-    def _event(self, tick: int) -> None:
-        """Let something happen."""
-        what = str(self.rng.choice(EVENTS))
-        self._told(f'{tick}: {what}')
-        self._lately = what
-        EVENTS_BY_NAME[what](self, tick)
-
     # What may happen.
 
     def _fail_sensor(self, tick: int) -> None:
         sensor = self.driver.sensor
-        fault = str(self.rng.choice(SENSOR_FAULTS))
-        sensor.fault = fault
+        sensor.fault = str(self.rng.choice(SENSOR_FAULTS))
         sensor.value = sensor.swing * float(self.rng.uniform(-1.0, 1.0))
-        self._told(f'    {fault}')
-        self._lately += f': {fault}'
+        self._told(f'    {sensor.fault}')
+        self._lately += f': {sensor.fault}'
         self._end_later(tick, lambda: setattr(sensor, 'fault', ''))
 
     def _let_driver(self, fault: str, tick: int) -> None:
@@ -153,12 +137,10 @@ class Sequence:
             controller.deactivate()
         estimate: Estimate | None = controller.loop.estimate
         chance = rng.random()
-        if chance < 0.4 or (estimate is not None and not estimate.learned):
-            estimate = None
-            self._foreign = False
+        if chance < 0.4 or not estimate.learned:
+            estimate, self._foreign = None, False
         elif chance < 0.6:
-            estimate = self._saved_elsewhere()
-            self._foreign = True
+            estimate, self._foreign = self._saved_elsewhere(), True
         self._told(f'    with {estimate}')
         # Where the driver does not say which v acts, whoever starts the controller does.
         self._newcomer = self.driver.reports
@@ -173,10 +155,9 @@ class Sequence:
 
     def _change_limits(self, tick: int) -> None:
         rng, p = self.rng, self.controller.p
-        changes: dict[str, object] = {}
-        for name in ('control.min', 'control.max', 'control.rate_max'):
-            if isfinite(float(p[name])):
-                changes[name] = float(self.p[name]) * float(rng.uniform(0.3, 1.5))
+        changes = {name: float(self.p[name]) * float(rng.uniform(0.3, 1.5))
+                   for name in ('control.min', 'control.max', 'control.rate_max')
+                   if isfinite(float(p[name]))}
         if changes:
             self._told(f'    {changes}')
             self.controller.take_up(p.replaced(changes))
@@ -198,9 +179,8 @@ class Sequence:
         self._bound.take_up(self.controller.p)
 
     def _call_service(self, tick: int) -> None:
-        rng, loop = self.rng, self.controller.loop
-        kind = int(rng.integers(3))
-        on = bool(rng.integers(2))
+        loop = self.controller.loop
+        kind, on = int(self.rng.integers(3)), bool(self.rng.integers(2))
         self._told(f'    {("freeze", "compensation", "reset")[kind]} {on}')
         if kind == 0:
             loop.adapt(on)
@@ -232,8 +212,7 @@ class Sequence:
         """What another axis with the same G has learned."""
         m, c_r, c_l = (value * float(self.rng.uniform(0.5, 2.0)) for value in self.truth)
         gap = c_r - c_l
-        return Estimate(m, c_r, c_l, self.p.proportional.f,
-                        1e-3 * m, 1e-3 * gap, 1e-3 * gap)
+        return Estimate(m, c_r, c_l, self.p.proportional.f, 1e-3 * m, 1e-3 * gap, 1e-3 * gap)
 
     # What is watched.
 
@@ -295,21 +274,15 @@ class Sequence:
             return
         m, c_r, c_l = self.truth
         gap = c_r - c_l
-        if e.learned:
-            self.claimed = True
-            stds = [max(DEVIATIONS * std, NEGLIGIBLE * size)
-                    for std, size in ((e.std_m, m), (e.std_c_r, gap), (e.std_c_l, gap))]
-        else:
-            stds = [WITHOUT * m, WITHOUT * gap, WITHOUT * gap]
-        off = max(abs(value - true) / std for value, true, std in
-                  zip((e.m, e.c_r, e.c_l), self.truth, stds, strict=True))
+        self.claimed |= e.learned
+        sizes = np.array([m, gap, gap])
+        allowed = np.maximum(DEVIATIONS * np.array([e.std_m, e.std_c_r, e.std_c_l]),
+                             NEGLIGIBLE * sizes) if e.learned else WITHOUT * sizes
+        off = float((np.abs(np.array([e.m, e.c_r, e.c_l]) - self.truth) / allowed).max())
         if off <= 1.0:
             return
-        kind = 'wrong' if e.learned else 'wrong_without'
-        if e.learned and self._foreign:
-            kind = 'wrong_inherited'
-        elif e.learned and self.p.truth.scale_frequency != 1.0:
-            kind = 'wrong_uncertain'
+        kind = 'wrong_without' if not e.learned else 'wrong_inherited' if self._foreign \
+            else 'wrong_uncertain' if self.p.truth.scale_frequency != 1.0 else 'wrong'
         self.found[kind].append(
             f'sample {self.driver.tick}, {off:.2g} times what is allowed: '
             f'm {e.m:.5g} ({m:.5g}) ± {e.std_m:.2g}, '
@@ -346,7 +319,6 @@ def _gain_at_rest(model: TransferFunction) -> float:
 
 
 def _shift(before: Estimate, now: Estimate, v: float) -> float:
-    """By how much a new estimate may move v."""
     crossings = max(abs(now.c_r - before.c_r), abs(now.c_l - before.c_l))
     reach = abs(v) + max(now.c_r, -now.c_l)
     by_f = abs(now.f - before.f) / (now.m - min(now.f, LARGEST_F_OVER_M * now.m)) * reach

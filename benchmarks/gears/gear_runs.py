@@ -1,7 +1,5 @@
 """Gears made of physics in one process: identified from limits alone, then in the closed loop."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -12,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from reporting import Array
 
 sys.path.append(str(Path(__file__).resolve().parents[2] / 'examples'))
 
@@ -29,7 +28,6 @@ from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.parameter import Value
 from backlash_ros.tools.identify.identified_file import as_estimate, identified_parameters
 
-Array = NDArray[np.float64]
 Motion = Callable[[float], float]  # of the phase [rad], between -1 and 1
 
 # Options of `identify`, in the order in which its own messages propose them.
@@ -57,9 +55,8 @@ def _triangle(phase: float) -> float:
     return 2.0 / pi * asin(max(-1.0, min(1.0, sin(phase))))
 
 
-def _multisine(phase: float) -> float:
-    parts = ((0.6, 1.0, 0.0), (0.3, 2.0, 1.0), (0.2, 3.0, 4.0))
-    return sum(size * sin(times * phase + shift) for size, times, shift in parts) / 0.95
+def _multisine(x: float) -> float:
+    return (0.6 * sin(x) + 0.3 * sin(2.0 * x + 1.0) + 0.2 * sin(3.0 * x + 4.0)) / 0.95
 
 
 # Shape, and frequency over that of the preset; the last one moves half of the time, and rests.
@@ -83,7 +80,6 @@ class Run:
 
     @property
     def error(self) -> float:
-        """RMS of y - y_m [y]."""
         return float(np.sqrt(np.mean((self.y - self.y_m)[self.first:]**2)))
 
     def said_tracking_off_by(self, lost_motion: float) -> float:
@@ -106,10 +102,9 @@ def quasi_static(gear: Gear) -> tuple[Array, Array, Array]:
 
 def lost_motion(v: Array, load: Array) -> float:
     """Distance along v of the two branches of a hysteresis loop, in its middle half."""
-    middle = np.abs(load) < 0.5 * np.abs(load).max()
-    speed = np.gradient(load)
-    apart = [np.median((v - load)[middle & (sign * speed > 0.0)]) for sign in (1.0, -1.0)]
-    return float(apart[0] - apart[1])
+    middle, speed = np.abs(load) < 0.5 * np.abs(load).max(), np.gradient(load)
+    ahead, back = (np.median((v - load)[middle & (sign * speed > 0.0)]) for sign in (1.0, -1.0))
+    return float(ahead - back)
 
 
 def record(gear: Gear, seconds: float = STROKES_S) -> tuple[Array, Array, Array]:
@@ -144,14 +139,11 @@ class Identified(NamedTuple):
 
     @property
     def said(self) -> str:
-        """What a user reads."""
-        if self.refused:
-            return f'refused: {self.refused}'
-        return '; '.join(self.found.reasons) or 'of use'
+        return f'refused: {self.refused}' if self.refused \
+            else '; '.join(self.found.reasons) or 'of use'
 
     @property
     def controller(self) -> AdaptiveController:
-        """The controller that begins with the identified file."""
         assert self.parameters is not None
         return build_controller(self.parameters, as_estimate(self.found, self.parameters))
 
@@ -188,10 +180,11 @@ def constant(
 ) -> AdaptiveController:
     """The same with these constants for good."""
     return build_controller(parameters.replaced({
-        'estimator.law': 'fixed', 'fixed.doubt': doubt,
-        'estimator.bounds.m': (0.1 * m, 10.0 * m), 'estimator.initial.m': m,
-        'estimator.bounds.c_r': (0.0, max(2.0 * c_r, 1e-9)), 'estimator.initial.c_r': c_r,
-        'estimator.bounds.c_l': (min(2.0 * c_l, -1e-9), 0.0), 'estimator.initial.c_l': c_l,
+        'estimator.law': 'fixed', 'fixed.doubt': doubt, 'estimator.initial.m': m,
+        'estimator.initial.c_r': c_r, 'estimator.initial.c_l': c_l,
+        'estimator.bounds.m': (0.1 * m, 10.0 * m),
+        'estimator.bounds.c_r': (0.0, max(2.0 * c_r, 1e-9)),
+        'estimator.bounds.c_l': (min(2.0 * c_l, -1e-9), 0.0),
     }))
 
 
@@ -205,15 +198,13 @@ def close_loop(
     samples = round(periods / frequency / period)
     size = gear.scale * gear.swing
     reference = size * np.array([shape(2.0 * pi * frequency * period * k) for k in range(samples)])
-    physics = GearPhysics(gear)
-    rows = np.zeros((samples, 4))
+    physics, rows = GearPhysics(gear), np.zeros((samples, 4))
     applied: tuple[float, ...] = ()
     for k in range(samples):
         y, motor = physics.load, physics.motor
         step = controller.step(physics.load_encoder(), float(reference[k]), applied=applied)
         controller.refine()
-        e = step.estimate
-        rows[k] = y, motor, e.c_r - e.c_l, e.status
+        rows[k] = y, motor, step.estimate.c_r - step.estimate.c_l, step.estimate.status
         physics.move_to(step.v)
         physics.advance(period)
         applied = (physics.motor_encoder(),) if encoder else ()

@@ -1,7 +1,5 @@
 """The barest node that answers: it publishes every number it gets. A yardstick for latency."""
 
-from __future__ import annotations
-
 import contextlib
 
 import rclpy

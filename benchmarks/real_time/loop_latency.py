@@ -1,33 +1,29 @@
 """Latency from y to v through DDS beside a bare echo node, and the speed of lockstep."""
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rclpy
-from reporting import Check
+from rclpy.publisher import Publisher
+from reporting import Check, Measured
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_plant, build_reference
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import BY_NAME, CONTROLLER
-from real_time.measuring_node import MeasuringNode
-from real_time.node_processes import (
-    DEADLINE_S,
-    check_running,
-    node_command,
-    processes,
-    wait_for_event,
-)
+from real_time import measuring
+from real_time.measuring import DEADLINE_S, MeasuringNode, node_command, processes, wait_for_event
 
 RATES_HZ = (100.0, 1000.0)
+LOOPS = (('moving_horizon', 'proportional'), ('moving_horizon', 'tracking'),
+         ('lms', 'proportional'))
 BLOCK, SETTLE = 50, 10  # samples of a block, and how many of them at its start do not count
 WARM_UP_S = 3.0  # acquisition is not counted either
 PATIENCE_S = 0.2  # for an answer
@@ -37,33 +33,17 @@ LOCKSTEP_SAMPLES = 3000
 
 @dataclass
 class Latencies:
-    """Times from question to answer [s] of one rate, and questions without an answer."""
+    """Times from question to answer [s], and questions without an answer."""
 
-    rate: float
     controller: list[float] = field(default_factory=list)
     echo: list[float] = field(default_factory=list)
     unanswered: int = 0
 
     def ratio(self, quantile: float) -> float:
-        """Quantile of the controller over that of the echo."""
         return float(np.quantile(self.controller, quantile) / np.quantile(self.echo, quantile))
 
-    @property
-    def rows(self) -> list[list[str]]:
-        """Cells: rate, p50 and p99 of controller and echo in us, their ratio, how many."""
-        rows = []
-        for quantile in (0.5, 0.99):
-            of_controller = 1e6 * float(np.quantile(self.controller, quantile))
-            of_echo = 1e6 * float(np.quantile(self.echo, quantile))
-            rows.append([
-                f'{self.rate:g} Hz', f'p{100 * quantile:g}', f'{of_controller:.0f}',
-                f'{of_echo:.0f}', f'{self.ratio(quantile):.2f}',
-                f'{len(self.controller)} + {len(self.echo)}',
-            ])
-        return rows
 
-
-LATENCY_HEADER = ('rate', '', 'y to v [us]', 'echo [us]', 'ratio', 'samples')
+LATENCY_HEADER = ('loop', 'rate', '', 'y to v [us]', 'echo [us]', 'ratio', 'samples')
 
 
 class Driver(MeasuringNode):
@@ -76,14 +56,12 @@ class Driver(MeasuringNode):
         self._v = self._v_before = 0.0
         self._v_came_at = 0.0
         self._answered_at: float | None = None
-        node = self.node
-        self._y_m = node.create_publisher(Float64, topics.REFERENCE, 1)
-        self._y = node.create_publisher(Float64, topics.PLANT_OUTPUT, 1)
-        self._question = node.create_publisher(Float64, 'echo/in', 1)
+        self._asked = self._y_m, self._y, self._question = [
+            self.node.create_publisher(Float64, topic, 1)
+            for topic in (topics.REFERENCE, topics.PLANT_OUTPUT, 'echo/in')]
         self._answers = [
-            node.create_subscription(Float64, topics.CONTROL, self._on_control, 1),
-            node.create_subscription(Float64, 'echo/out', self._on_echo, 1),
-        ]
+            self.node.create_subscription(Float64, topics.CONTROL, self._on_control, 1),
+            self.node.create_subscription(Float64, 'echo/out', self._on_echo, 1)]
 
     def _on_control(self, message: Float64, info: dict[str, Any]) -> None:
         self._answered_at = time.perf_counter()
@@ -95,17 +73,12 @@ class Driver(MeasuringNode):
     def _on_echo(self, message: Float64) -> None:
         self._answered_at = time.perf_counter()
 
-    def _connected(self) -> bool:
-        publishers = (self._y_m, self._y, self._question)
-        return all(p.get_subscription_count() for p in publishers) and all(
-            s.get_publisher_count() for s in self._answers)
-
     def connect(self) -> None:
         """Return once everybody is heard and the controller has a reference."""
-        if not self.wait_for(self._connected, DEADLINE_S):
-            raise RuntimeError(f'the nodes were not there within {DEADLINE_S:g} s')
+        self.wait_for(lambda: all(p.get_subscription_count() for p in self._asked) and all(
+            s.get_publisher_count() for s in self._answers), DEADLINE_S, 'the nodes')
 
-    def _ask(self, publisher: rclpy.publisher.Publisher, value: float) -> float | None:
+    def _ask(self, publisher: Publisher, value: float) -> float | None:
         message = Float64(data=value)
         self._answered_at = None
         start = time.perf_counter()
@@ -118,7 +91,7 @@ class Driver(MeasuringNode):
 
     def measure(self, duration_s: float) -> Latencies:
         """Be the plant, and ask both in alternating blocks, once the controller is warmed up."""
-        result = Latencies(1.0 / self._period)
+        result = Latencies()
         start, tick = time.perf_counter(), 0
         while (now := time.perf_counter() - start) < WARM_UP_S + duration_s:
             due = int(now / self._period) + 1
@@ -161,36 +134,37 @@ def measure_latency(
         **(changes or {}),
     })
     commands = {
-        'controller': node_command('controller', _values_of(CONTROLLER, parameters)),
+        'controller': node_command('controller', {
+            p.name: parameters[p.name] for p in BY_NAME.values()
+            if CONTROLLER in p.used_by and parameters[p.name] != p.default}),
         'echo': [sys.executable, str(Path(__file__).with_name('echo_node.py'))],
     }
     with processes(commands) as (supervisor, domain):
-        driver = Driver(domain, parameters)
-        try:
+        with closing(Driver(domain, parameters)) as driver:
             driver.connect()
             result = driver.measure(duration_s)
-        finally:
-            driver.close()
-        check_running(supervisor)
+        measuring.check_running(supervisor)
     if not (result.controller and result.echo):
         raise RuntimeError(f'{law}, {rate:g} Hz: nobody answered')
     return result
 
 
-def _values_of(executable: str, parameters: Parameters) -> dict[str, object]:
-    return {
-        parameter.name: parameters[parameter.name] for parameter in BY_NAME.values()
-        if executable in parameter.used_by and parameters[parameter.name] != parameter.default
-    }
-
-
-def latency_checks(found: Latencies, law: str) -> list[Check]:
-    """The bounds on the ratio to the echo."""
-    return [
-        Check(f'y to v / bare echo, p{100 * quantile:g}, {law}, {found.rate:g} Hz',
-              f'<= {limit:g}', f'{found.ratio(quantile):.2f}', found.ratio(quantile) <= limit)
-        for quantile, limit in LATENCY_LIMITS.items()
-    ]
+def measure_latencies(duration_s: float) -> Measured:
+    """Of every loop at every rate: p50 and p99 of controller and echo, and the bounds on them."""
+    rows, checks = [], []
+    for (law, structure), rate in product(LOOPS, RATES_HZ):
+        name = f'{law}, {structure}'
+        found = measure_latency(rate, law, duration_s, {'structure': structure})
+        for q, limit in LATENCY_LIMITS.items():
+            us = [f'{1e6 * np.quantile(of, q):.0f}' for of in (found.controller, found.echo)]
+            rows.append([name, f'{rate:g} Hz', f'p{100 * q:g}', *us, f'{found.ratio(q):.2f}',
+                         f'{len(found.controller)} + {len(found.echo)}'])
+            checks.append(Check(
+                f'y to v / bare echo, p{100 * q:g}, {name}, {rate:g} Hz', f'<= {limit:g}',
+                f'{found.ratio(q):.2f}', found.ratio(q) <= limit))
+        if found.unanswered:
+            print(f'{name}, {rate:g} Hz: {found.unanswered} samples without an answer')
+    return rows, checks
 
 
 def lockstep_speed(law: str, samples: int = LOCKSTEP_SAMPLES) -> float:
@@ -198,6 +172,6 @@ def lockstep_speed(law: str, samples: int = LOCKSTEP_SAMPLES) -> float:
     values = {'lockstep': True, 'samples': samples, 'estimator.law': law, 'seed': 1}
     commands = {name: node_command(name, values) for name in ('controller', 'reference', 'plant')}
     with processes(commands) as (supervisor, _):
-        started = wait_for_event(supervisor, lambda kind, who: (kind, who) == ('ready', 'plant'))
-        done = wait_for_event(supervisor, lambda kind, _: kind == 'done')
+        started = wait_for_event(supervisor, 'ready', 'plant')
+        done = wait_for_event(supervisor, 'done', 'plant')
     return samples / (done - started)

@@ -1,20 +1,24 @@
 """What the benchmarks share: bounds with verdicts, tables as text and Markdown, the machine."""
 
-from __future__ import annotations
-
+import argparse
 import os
 import platform
+import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from multiprocessing import Pool
 from pathlib import Path
 from typing import TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+from PIL.Image import Dither, Image
 from tqdm import tqdm
 
 Item = TypeVar('Item')
 Result = TypeVar('Result')
 
+Array = NDArray[np.float64]
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -29,43 +33,47 @@ class Check:
 
     @property
     def row(self) -> list[str]:
-        """Cells of a table."""
         return [self.what, self.bound, self.measured, 'holds' if self.holds else 'FAILS']
 
 
+Measured = tuple[list[list[str]], list[Check]]  # rows of a table, and the bounds
 CHECK_HEADER = ('what', 'bound', 'measured', 'verdict')
 
 
-def text_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Columns as wide as they need to be, for a terminal."""
-    lines = [list(header), *map(list, rows)]
-    widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
-    return '\n'.join(
-        '  '.join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()
-        for line in lines
-    )
-
-
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """The same table for a document."""
-    lines = [list(header), ['---'] * len(header), *map(list, rows)]
+    """A table for a document."""
+    lines = [header, ['---'] * len(header), *rows]
     return '\n'.join('| ' + ' | '.join(line) + ' |' for line in lines)
 
 
+def write_between(page: Path, name: str, text: str) -> None:
+    """Write what is made by a program between its marks in a page, `<!-- name: ... -->`."""
+    marks = re.compile(rf'(<!-- {name}: made by .*? -->\n).*?(<!-- end -->)', re.DOTALL)
+    page.write_text(marks.sub(lambda mark: f'{mark[1]}{text}\n{mark[2]}', page.read_text()))
+
+
+def save_film(
+    path: Path, frames: Sequence[Image], palette: Image, frame_s: float, last_s: float,
+) -> None:
+    """Write a GIF: one palette for all, else colours flicker; dithering would not compress."""
+    first, *others = (frame.quantize(palette=palette, dither=Dither.NONE) for frame in frames)
+    first.save(path, save_all=True, append_images=others, loop=0, optimize=False,
+               duration=[*[round(1e3 * frame_s)] * len(others), round(1e3 * last_s)])
+
+
+def parser_of(doc: str | None) -> argparse.ArgumentParser:
+    return argparse.ArgumentParser(
+        description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+
+
 def processors() -> int:
-    """Processors that this process may use."""
-    if hasattr(os, 'sched_getaffinity'):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return len(os.sched_getaffinity(0))
 
 
 def machine() -> str:
     """Processor model, number of processors and Python, without any name of a computer."""
-    model = platform.machine()
-    info = Path('/proc/cpuinfo')
-    if info.exists():
-        names = [line for line in info.read_text().splitlines() if line.startswith('model name')]
-        model = names[0].split(':')[1].strip() if names else model
+    names = re.findall('^model name.*: (.+)', Path('/proc/cpuinfo').read_text(), re.MULTILINE)
+    model = (names or [platform.machine()])[0]
     return f'{model}, {processors()} processors, Python {platform.python_version()}'
 
 

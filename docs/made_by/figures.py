@@ -5,48 +5,30 @@ Pictures go to docs/images. Numbers go between the marks
 docs/reference/parameters.md is written as a whole.
 """
 
-from __future__ import annotations
-
-import re
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+sys.path.append(str(Path(__file__).resolve().parents[2] / 'benchmarks'))
 
 import numpy as np
 from generate_parameters import write_parameters
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from reporting import write_between
 from runs import WITHOUT, simulate
 from tables import TABLES
 
 from backlash_ros.core.simulation.metrics import delayed_reference
 from backlash_ros.core.simulation.run_record import RunRecord
-from backlash_ros.tools.figures import (
-    BACKLASH_UNITS,
-    HATS,
-    HUES,
-    LINE_STYLES,
-    TIME_LABEL,
-    band,
-    curve,
-    draw_error_curves,
-    draw_hysteresis,
-    label,
-    legend_above,
-    legend_below,
-    new_figure,
-    png,
-    shade,
-    zero_line,
-)
+from backlash_ros.tools import figures as drawn
+from backlash_ros.tools.figures import BACKLASH_UNITS, HATS, HUES, TIME_LABEL, curve, label
 from backlash_ros.tools.runs.summary import compare_laws, interesting_parts
 
 DOCS = Path(__file__).resolve().parents[1]
 IMAGES = DOCS / 'images'
 PAGES = [DOCS.parent / 'README.md', *DOCS.rglob('*.md')]
-MARK = re.compile(
-    r'(<!-- (\w+): made by docs/made_by/figures\.py -->\n).*?(<!-- end -->)', re.DOTALL
-)
 NAMES = ('m', 'c_r', 'c_l')
 WITH_COLOUR, WITHOUT_COLOUR = '#0072B2', '#D55E00'
 SMALL = {'structure': 'tracking', 'amplitude': '0.2'}
@@ -61,18 +43,18 @@ def draw_result() -> Figure:
     gear = {'amplitude': '0.3'}
     plain = simulate(4.0, {**gear, **WITHOUT}, 'geared_motor.yaml').record
     learned = simulate(4.0, gear, 'geared_motor.yaml').record
-    figure = new_figure(6.4)
+    figure = drawn.new_figure(6.4)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[1.3, 1.0])
     t = learned.column('t')
     curve(upper, t, learned.column('y_m'), HUES['y_m'], 'reference $y_m$', '--')
     curve(upper, t, plain.column('y'), WITHOUT_COLOUR, 'y without compensation', width=1.8)
     curve(upper, t, learned.column('y'), WITH_COLOUR, 'y with this package', width=1.8)
     label(upper, 'Load behind a worn gear', 'angle [rad]')
-    legend_above(upper)
+    drawn.legend_above(upper)
     _draw_shares(lower, learned)
     label(lower, 'What is learned from v and y', 'estimate / truth', TIME_LABEL)
     lower.set_ylim(-0.05, 1.15)
-    legend_above(lower)
+    drawn.legend_above(lower)
     return figure
 
 
@@ -81,26 +63,25 @@ def _draw_shares(axes: Axes, run: RunRecord) -> None:
     axes.axhline(1.0, label='truth', **RESTING)
     for name, width in zip(NAMES, (1.4, 2.4, 1.6), strict=True):
         share = run.column(name) / run.column(f'true_{name}')
-        curve(axes, t, share, HUES[name], f'${HATS[name]}$', LINE_STYLES[name], width)
+        curve(axes, t, share, HUES[name], f'${HATS[name]}$', drawn.LINE_STYLES[name], width)
 
 
 def draw_figure_4() -> Figure:
     """Parameter errors of three laws on the paper's example, as Figure 4 and as shares."""
-    figure = new_figure(6.6)
+    figure = drawn.new_figure(6.6)
     grid = np.asarray(figure.subplots(2, 3, sharex=True, sharey='row'))
     for column, law in enumerate(('printed', 'lms', 'moving_horizon')):
-        run = simulate(5.0, {'estimator.law': law}).record
-        absolute, relative = grid[0][column], grid[1][column]
+        run, (absolute, relative) = simulate(5.0, {'estimator.law': law}).record, grid[:, column]
         t = run.column('t')
         for name in NAMES:
             truth = run.column(f'true_{name}')
             error = truth - run.column(name)
             unit = BACKLASH_UNITS[name].removeprefix('unit of ')
             curve(absolute, t, error, HUES[name], f'${name} - {HATS[name]}$ [{unit}]',
-                  LINE_STYLES[name], 1.8)
+                  drawn.LINE_STYLES[name], 1.8)
             percent = np.maximum(100.0 * np.abs(error / truth), 1e-12)
-            curve(relative, t, percent, HUES[name], '', LINE_STYLES[name], 1.5)
-        zero_line(absolute)
+            curve(relative, t, percent, HUES[name], '', drawn.LINE_STYLES[name], 1.5)
+        drawn.zero_line(absolute)
         relative.set_yscale('log')
         relative.set_ylim(1e-6, 1e3)
         label(absolute, f'estimator.law: {law}')
@@ -108,7 +89,7 @@ def draw_figure_4() -> Figure:
     grid[0][0].set_ylim(-3.0, 3.0)
     label(grid[0][0], y='true minus estimated')
     label(grid[1][0], y='size of the error [%]')
-    legend_below(figure, grid[0][1])
+    drawn.legend_below(figure, grid[0][1])
     return figure
 
 
@@ -116,32 +97,31 @@ def draw_figure_5() -> Figure:
     """Control errors of the laws on the paper's example, as Figure 5."""
     run = simulate(5.0)
     curves, window_s, _ = compare_laws(run.record, run.parameters)
-    return draw_error_curves(curves, window_s)
+    return drawn.draw_error_curves(curves, window_s)
 
 
 def draw_loop() -> Figure:
-    """The v-u loop of the paper's example at the end of a run."""
     run = simulate(5.0)
     _, end = interesting_parts(run.record, run.parameters)
-    return draw_hysteresis(run.record, end)
+    return drawn.draw_hysteresis(run.record, end)
 
 
 def draw_uncertain_plant() -> Figure:
     """Errors of the crossings where the true plant is not G: G believed, and the default."""
-    figure = new_figure(6.4)
+    figure = drawn.new_figure(6.4)
     grid = np.asarray(figure.subplots(2, 2, sharex=True, sharey='row'))
     kinds = (('plant.uncertainty: 0', '0.0', 50.0), ('default', '0.2', 0.4))
     for line, (name, uncertainty, reach) in zip(grid, kinds, strict=True):
         for axes, scale in zip(line, ('0.8', '1.2'), strict=True):
             change = {'truth.scale_frequency': scale, 'plant.uncertainty': uncertainty}
             _draw_crossing_errors(axes, simulate(6.0, change, 'geared_motor.yaml').record)
-            zero_line(axes)
+            drawn.zero_line(axes)
             axes.set_ylim(-reach, reach)
             label(axes, f'true natural frequency × {scale}, {name}')
         label(line[0], y='error [% of the truth]')
     for axes in grid[1]:
         label(axes, x=TIME_LABEL)
-    legend_below(figure, grid[0][0])
+    drawn.legend_below(figure, grid[0][0])
     return figure
 
 
@@ -153,10 +133,10 @@ def _draw_crossing_errors(axes: Axes, run: RunRecord) -> None:
         # Before the first estimate there is no deviation, and so no curve.
         percent = 100.0 * (run.column(name) - truth + 0.0 * std) / np.abs(truth)
         around = 200.0 * std / np.abs(truth)
-        band(axes, t, percent - around, percent + around, HUES[name],
+        drawn.band(axes, t, percent - around, percent + around, HUES[name],
              '±2 published standard deviations' if name == 'c_r' else '')
-        curve(axes, t, percent, HUES[name], f'${HATS[name]}$', LINE_STYLES[name], 1.6)
-    shade(axes, t, run.column('status') == 4.0, 'frozen: inconsistent')
+        curve(axes, t, percent, HUES[name], f'${HATS[name]}$', drawn.LINE_STYLES[name], 1.6)
+    drawn.shade(axes, t, run.column('status') == 4.0, 'frozen: inconsistent')
 
 
 def draw_recovery() -> Figure:
@@ -164,14 +144,14 @@ def draw_recovery() -> Figure:
     jump = {'output_noise_std': '1e-3', 'backlash.jump': '[0.0, 1.0, 0.0]',
             'backlash.jump_time': '3.0'}
     run = simulate(5.0, jump).record
-    figure = new_figure(4.0)
+    figure = drawn.new_figure(4.0)
     axes = figure.subplots()
     t = run.column('t')
     axes.plot(t, run.column('true_c_r'), label='true', **RESTING)
     curve(axes, t, run.column('c_r'), HUES['c_r'], f'${HATS["c_r"]}$', width=1.8)
-    shade(axes, t, run.column('status') == 4.0, 'frozen: inconsistent')
+    drawn.shade(axes, t, run.column('status') == 4.0, 'frozen: inconsistent')
     label(axes, '$c_r$ steps from 3 to 4', f'[{BACKLASH_UNITS["c_r"]}]', TIME_LABEL)
-    legend_above(axes)
+    drawn.legend_above(axes)
     axes.set_ylim(0.0, 4.5)
     return figure
 
@@ -183,7 +163,7 @@ def draw_tracking() -> Figure:
         'adaptive inverse': (simulate(6.0, SMALL), WITH_COLOUR, '-'),
         'no backlash': (simulate(6.0, {**SMALL, **NO_INVERSE, **NO_GAP}), '#000000', '--'),
     }
-    figure = new_figure(6.4)
+    figure = drawn.new_figure(6.4)
     upper, lower = figure.subplots(2, 1, sharex=True)
     for name, (run, colour, style) in loops.items():
         t, reference = run.record.column('t'), delayed_reference(run.record, run.delay)
@@ -196,34 +176,26 @@ def draw_tracking() -> Figure:
     lower.set_xlim(0.0, 4.0)
     label(upper, 'Output', '[unit of y]')
     label(lower, 'Distance from the delayed reference', 'share of the amplitude', TIME_LABEL)
-    legend_above(upper)
-    legend_above(lower)
+    drawn.legend_above(upper)
+    drawn.legend_above(lower)
     return figure
 
 
 FIGURES: dict[str, Callable[[], Figure]] = {
     'result': draw_result, 'figure_4': draw_figure_4, 'figure_5': draw_figure_5,
     'hysteresis': draw_loop, 'recovery': draw_recovery, 'tracking': draw_tracking,
-    'uncertain_plant': draw_uncertain_plant,
-}
-
-
-def fill_in(page: Path) -> None:
-    """Write the tables between their marks."""
-    text = page.read_text(encoding='utf-8')
-    filled = MARK.sub(lambda found: f'{found[1]}{TABLES[found[2]]()}\n{found[3]}', text)
-    if filled != text:
-        page.write_text(filled, encoding='utf-8')
+    'uncertain_plant': draw_uncertain_plant}
 
 
 def main() -> None:
-    """Make everything."""
     IMAGES.mkdir(exist_ok=True)
     for name, draw in FIGURES.items():
-        (IMAGES / f'{name}.png').write_bytes(png(draw()))
+        (IMAGES / f'{name}.png').write_bytes(drawn.png(draw()))
     write_parameters()
     for page in PAGES:
-        fill_in(page)
+        for name, table in TABLES.items():
+            if f'<!-- {name}: made by docs/made_by/figures.py -->' in page.read_text():
+                write_between(page, name, table())
 
 
 if __name__ == '__main__':

@@ -1,7 +1,5 @@
 """Writes docs/reference/parameters.md from the one table of parameters; `make docs` calls it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from backlash_ros.core.parameters.parameter import Parameter, as_yaml
@@ -22,7 +20,6 @@ a running node; all others of `controller`, but for those marked *fixed*, while 
 
 
 def parameters_page() -> str:
-    """The whole page."""
     return HEAD + ''.join(f'{_row(parameter)}\n' for parameter in BY_NAME.values())
 
 
@@ -41,7 +38,6 @@ def _allowed(p: Parameter) -> str:
 
 
 def write_parameters() -> None:
-    """Write the page."""
     PAGE.write_text(parameters_page(), encoding='utf-8')
 
 

@@ -1,7 +1,5 @@
 """The simulated runs that the documents show."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -39,8 +37,7 @@ def simulate(
 @cache
 def _simulate(duration: float, settings: tuple[tuple[str, str], ...], config: str | None) -> Run:
     parameters = effective_parameters(
-        Path(config) if config else None, [f'{name}={value}' for name, value in settings]
-    )
+        Path(config) if config else None, [f'{name}={value}' for name, value in settings])
     loop = build_closed_loop(parameters)
     record = run_loop(loop, round(duration / parameters.sample_period))
     learned = loop.controller.redesign.adopted

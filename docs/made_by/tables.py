@@ -1,21 +1,14 @@
 """The tables with numbers that `make docs` writes into the pages."""
 
-from __future__ import annotations
-
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from itertools import product
-from pathlib import Path
 
 import combinations_of_laws
 import numpy as np
-from printed_law import (
-    Reading,
-    error_growth,
-    first_not_finite,
-    last_estimate,
-    moves_after_the_first,
-)
+import printed_law
+from reporting import ROOT
+from reporting import markdown_table as markdown
 from runs import simulate
 
 from backlash_ros.core.assembly import build_model, build_true_model
@@ -28,7 +21,6 @@ from backlash_ros.core.simulation.run_record import RunRecord
 NAMES = ('m', 'c_r', 'c_l')
 SECONDS = 10.0
 DISTURBANCE = 2.0
-ROOT = Path(__file__).resolve().parents[2]
 SETTINGS = ROOT / 'backlash_ros' / 'core' / 'estimation' / 'settings.py'
 MOTOR = 'geared_motor.yaml'
 # True plants that differ from the G(z) of MOTOR, by what is set.
@@ -45,18 +37,11 @@ TRUE_PLANTS: dict[str, dict[str, str]] = {
 RESPONSE_HZ = (2.5, 10.0)  # frequencies at which G is compared
 
 
-def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table in Markdown."""
-    lines = [header, ['---'] * len(header), *rows]
-    return '\n'.join('| ' + ' | '.join(line) + ' |' for line in lines)
-
-
 def plant_facts() -> str:
     """What G(z) of the example is like."""
     p = simulate(SECONDS).parameters
-    model = TransferFunction(p.plant.numerator, p.plant.denominator)
-    period, frequency = p.sample_period, p.frequency
-    gain = abs(model.response(np.exp(1j * np.array([frequency * period])))[0])
+    model, frequency = build_model(p), p.frequency
+    gain = abs(model.response(np.exp(1j * np.array([frequency * p.sample_period])))[0])
     poles = sorted(np.abs(model.poles), reverse=True)
     return markdown(('of G(z)', 'value', 'and therefore'), (
         ('poles', ', '.join(f'{pole:.5f}' for pole in poles),
@@ -89,39 +74,33 @@ def laws() -> str:
 
 def printed_moves() -> str:
     """Consequence 1 of the printed law."""
-    moves = moves_after_the_first()
-    return markdown(
-        ('mean change of', 'newest values', 'all values old'),
-        [(name, f'{new:.1g}', f'{old:.2g}') for name, (new, old) in moves.items()],
-    )
+    return markdown(('mean change of', 'newest values', 'all values old'), [
+        (name, f'{new:.1g}', f'{old:.2g}')
+        for name, (new, old) in printed_law.moves_after_the_first().items()])
 
 
 def printed_not_finite() -> str:
     """Consequence 2 of the printed law."""
-    sample, name = first_not_finite()
-    return markdown(
-        ('without guards', ''),
-        [('first quotient that is 0/0', f'`{name}`'), ('at sample', str(sample))],
-    )
+    sample, name = printed_law.first_not_finite()
+    return markdown(('without guards', ''), [
+        ('first quotient that is 0/0', f'`{name}`'), ('at sample', str(sample))])
 
 
 def printed_growth() -> str:
     """Consequence 3 of the printed law."""
-    return markdown(
-        ('f', 'measured e(t+1) / e(t)', 'm / f'),
-        [(f'{f:g}', f'{error_growth(f):.4f}', f'{1.3 / f:.4f}') for f in (0.22, 0.5, 1.0)],
-    )
+    return markdown(('f', 'measured e(t+1) / e(t)', 'm / f'), [
+        (f'{f:g}', f'{printed_law.error_growth(f):.4f}', f'{1.3 / f:.4f}')
+        for f in (0.22, 0.5, 1.0)])
 
 
 def printed_readings() -> str:
     """Where a dozen readings of the printed law end."""
     rows = []
     for newest, learns_f, relaxation in product((True, False), (True, False), (1.0, 0.1, 0.01)):
-        e = last_estimate(Reading(newest, relaxation, learns_f), SECONDS)
-        rows.append((
-            'newest' if newest else 'old', 'learned' if learns_f else 'kept', f'{relaxation:g}',
-            f'{e.m:.3g}', f'{e.c_r:.3g}', f'{e.c_l:.3g}',
-        ))
+        e = printed_law.last_estimate(
+            printed_law.Reading(newest, relaxation, learns_f), SECONDS)
+        rows.append(('newest' if newest else 'old', 'learned' if learns_f else 'kept',
+                     f'{relaxation:g}', f'{e.m:.3g}', f'{e.c_r:.3g}', f'{e.c_l:.3g}'))
     return markdown(('values used', 'f', 'step', 'm', 'c_r', 'c_l'),
                     [('truth', '', '', '1.3', '3', '-3'), *rows])
 
@@ -134,11 +113,8 @@ def disturbance() -> str:
     last = run.column('t') > run.column('t')[-1] - 1.0
     e = (run.column('u') + DISTURBANCE - run.column('u_d'))[last]
     expected = {'m': m, 'c_r': c_r + shift, 'c_l': c_l + shift}
-    rows = [
-        (f'`{name}`', f'{run.column(f"true_{name}")[-1]:.6g}', f'{value:.6g}',
-         f'{run.column(name)[-1]:.6g}')
-        for name, value in expected.items()
-    ]
+    rows = [(f'`{name}`', f'{run.column(f"true_{name}")[-1]:.6g}', f'{value:.6g}',
+             f'{run.column(name)[-1]:.6g}') for name, value in expected.items()]
     rows.append(('RMS of u + d − u_d, last second', '', '0', f'{np.sqrt(np.mean(e**2)):.1g}'))
     return markdown(('', 'backlash alone', 'shifted by −d/m', 'estimated'), rows)
 
@@ -150,11 +126,9 @@ def uncertain_plants() -> str:
         believed = simulate(2.0, {**change, 'plant.uncertainty': '0.0'}, MOTOR)
         free = simulate(2.0, change, MOTOR)
         true = build_true_model(free.parameters)
-        rows.append((
-            name, _crossing_errors(believed.record), _crossing_errors(free.record),
-            *(_response_errors(model, true, free.parameters)
-              for model in (build_model(free.parameters), free.model)),
-        ))
+        rows.append((name, _crossing_errors(believed.record), _crossing_errors(free.record),
+                     *(_response_errors(model, true, free.parameters)
+                       for model in (build_model(free.parameters), free.model))))
     at = ' and '.join(f'{f:g}' for f in RESPONSE_HZ)
     return markdown((
         'true plant', 'c_r, c_l with `plant.uncertainty: 0`', 'c_r, c_l with 0.2',
@@ -186,22 +160,15 @@ def _percent(share: complex) -> str:
 
 def estimator_constants() -> str:
     """What the method is tuned by, with the comment behind it, as it stands in the code."""
-    rows = [
-        (f'`{name}`', f'`{value}`', meaning) for name, value, meaning
-        in re.findall(r'^([A-Z_]+) = ([^#\n]+?) *# (.+)$', SETTINGS.read_text(), re.MULTILINE)
-    ]
-    return markdown(('constant', 'value', 'meaning'), rows)
+    found = re.findall(r'^([A-Z_]+) = ([^#\n]+?) *# (.+)$', SETTINGS.read_text(), re.MULTILINE)
+    return markdown(('constant', 'value', 'meaning'), [
+        (f'`{name}`', f'`{value}`', meaning) for name, value, meaning in found])
 
 
 def combinations() -> str:
-    """What every law comes to in every structure."""
     return markdown(*combinations_of_laws.rows())
 
 
-TABLES: dict[str, Callable[[], str]] = {
-    'plant_facts': plant_facts, 'laws': laws, 'printed_moves': printed_moves,
-    'printed_not_finite': printed_not_finite, 'printed_growth': printed_growth,
-    'printed_readings': printed_readings, 'disturbance': disturbance,
-    'uncertain_plants': uncertain_plants, 'combinations': combinations,
-    'estimator_constants': estimator_constants,
-}
+TABLES: dict[str, Callable[[], str]] = {table.__name__: table for table in (
+    plant_facts, laws, printed_moves, printed_not_finite, printed_growth, printed_readings,
+    disturbance, uncertain_plants, combinations, estimator_constants)}

@@ -1,17 +1,22 @@
-"""How far u_d may go in a sequence of faults: what docs/tracking.md and docs/faults.md promise."""
-
-from __future__ import annotations
+"""What is promised of commands: how far u_d may go, and that v goes on after an interruption."""
 
 from collections.abc import Iterator
+from copy import copy
+from dataclasses import replace
 from itertools import chain, product
 from math import inf
 
 import numpy as np
 
 from backlash_ros.core.assembly import build_controller, build_model, build_plant, build_state_model
-from backlash_ros.core.control.controller import ControlStep
+from backlash_ros.core.control.controller import AdaptiveController, ControlStep
+from backlash_ros.core.control.limits import at_rest
 from backlash_ros.core.control.paper_structure import LARGEST_F_OVER_M
-from backlash_ros.core.control.protocol import LARGEST_FEEDBACK, LARGEST_IN_ACQUISITION
+from backlash_ros.core.control.protocol import (
+    LARGEST_FEEDBACK,
+    LARGEST_IN_ACQUISITION,
+    ControlInput,
+)
 from backlash_ros.core.control.tracking.design import Weights, feedback_around
 from backlash_ros.core.control.tracking.rest import TOLERANCE
 from backlash_ros.core.control.tracking.tracking import FADING
@@ -39,11 +44,9 @@ class PromisedBound:
         self._segments: list[tuple[float, list[float]]] = []  # y and y_m of each new loop
 
     def begin(self, y: float) -> None:
-        """Another loop answers from this y on."""
         self._segments.append((y, []))
 
     def take_up(self, p: Parameters) -> None:
-        """Live parameters have changed."""
         self._weights.add(p.tracking.input_weight)
         self._noise = max(self._noise, p.estimator.output_noise_std)
 
@@ -94,15 +97,11 @@ class PromisedBound:
 
     def _called_for(self) -> float:
         """What full feedback in `tracking` makes of errors of y that would not matter at rest."""
-        p = self._p
         if self._structure != 'tracking':
             return 0.0
-        model = build_state_model(p)
-        gains = (
-            feedback_around(model, Weights(
-                weight, p.tracking.integral_weight, p.tracking.preview,
-            ), 1.0).gain for weight in self._weights
-        )
+        model, t = build_state_model(self._p), self._p.tracking
+        gains = (feedback_around(model, Weights(weight, t.integral_weight, t.preview), 1.0).gain
+                 for weight in self._weights)
         return TOLERANCE * self._noise * max(float(np.linalg.norm(gain)) for gain in gains)
 
     def _asked(self) -> float:
@@ -130,3 +129,23 @@ class PromisedBound:
                 plant.step(step.v)
                 largest = max(largest, abs(step.u_d + held))
         return largest
+
+
+class Uninterrupted:
+    """Inverse and structure of a core as they are now, to go on with what will be asked of it.
+
+    y and what is known of G do not matter to (3.2). So v, which was held, has to go on from an
+    interruption to the last bit as if there had been none.
+    """
+
+    def __init__(self, core: AdaptiveController) -> None:
+        self._inverse, self._structure = copy(core.inverse), copy(core.structure)
+
+    def command(self, step: ControlStep, core: AdaptiveController, band: float) -> float:
+        """v instead of that of the step. core: for what may be set meanwhile, as band, too."""
+        inverse, v_before = self._inverse, self._inverse.v
+        inverse.take_up = core.inverse.take_up
+        inverse.direction_band = band
+        used = step.estimate if core.compensating else replace(step.estimate, c_r=0.0, c_l=0.0)
+        inputs = ControlInput(step.y_m, step.y, used, core.estimator)
+        return core.limits.apply(self._structure.control(inputs, inverse).v, at_rest(v_before)).v
