@@ -5,29 +5,29 @@ import signal
 import subprocess
 import sys
 import uuid
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+import psutil
 from rosbags.highlevel import AnyReader
 from waiting import DEADLINE_S, wait_until
 
 from backlash_ros.tools.bringup import __main__ as bringup
 
+MARK = 'BACKLASH_TEST_RUN'  # a variable of the environment
 UNDRAWN = Path(__file__).with_name('undrawn.py')
 
 
 def marked_processes(mark: str) -> dict[int, str]:
     """Command lines of all processes whose environment holds the mark, by process id."""
     found = {}
-    for folder in Path('/proc').glob('[0-9]*'):
-        try:
-            if mark.encode() in (folder / 'environ').read_bytes():
-                command = (folder / 'cmdline').read_bytes().replace(b'\0', b' ')
-                found[int(folder.name)] = command.decode().strip()
-        except OSError:
-            continue  # gone meanwhile, or of another user
+    for process in psutil.process_iter():
+        with suppress(psutil.Error):  # gone meanwhile, or of another user
+            if process.environ().get(MARK) == mark:
+                found[process.pid] = ' '.join(process.cmdline())
     return found
 
 
@@ -65,7 +65,6 @@ class Session:
         return marked_processes(self.mark)
 
     def node(self, name: str, namespace: str = '') -> int:
-        """Process id of a node."""
         module = f'backlash_ros.nodes.{name} '
         (pid,) = (
             pid for pid, command in self.survivors().items()
@@ -87,9 +86,8 @@ def bringup_sessions(folder: Path) -> Iterator[Callable[..., Session]]:
     ) -> Session:
         own = folder / str(len(sessions))
         own.mkdir()
-        mark = f'BACKLASH_TEST_RUN={uuid.uuid4()}'
-        name, value = mark.split('=')
-        environment = {**os.environ, name: value}
+        mark = uuid.uuid4().hex
+        environment = {**os.environ, MARK: mark}
         for variable in ('ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE'):
             environment.pop(variable, None)
         environment.update(variables or {})
@@ -117,10 +115,5 @@ def bringup_sessions(folder: Path) -> Iterator[Callable[..., Session]]:
 
 
 def bag_counts(bag: Path) -> dict[str, int]:
-    """Messages per topic, without the leading slash."""
     with AnyReader([bag]) as reader:
-        counts: dict[str, int] = {}
-        for connection, _, _ in reader.messages():
-            topic = connection.topic.lstrip('/')
-            counts[topic] = counts.get(topic, 0) + 1
-        return counts
+        return Counter(connection.topic.lstrip('/') for connection, *_ in reader.messages())

@@ -35,7 +35,6 @@ def pytest_configure() -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """One computes while another waits for processes."""
     return 1 + (os.cpu_count() or 1)
 
 

@@ -1,9 +1,10 @@
 """Bags as the recorder writes them, of runs that were simulated."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from math import nan
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from rosbags.rosbag2 import StoragePlugin, Writer
@@ -20,13 +21,35 @@ TYPES = get_typestore(Stores.ROS2_JAZZY)
 MULTI_ARRAY = 'std_msgs/msg/Float64MultiArray'
 
 
-def multi_array(labels: tuple[str, ...], values: list[float]) -> bytes:
+FLOAT = 'std_msgs/msg/Float64'
+
+
+def write_messages(
+    path: Path, messages: Iterable[tuple[int, str, str, bytes]],
+    storage: StoragePlugin = StoragePlugin.MCAP,
+) -> Path:
+    """Write a bag of messages: stamp, topic, type, content; in the order of their stamps."""
+    connections: dict[str, Any] = {}
+    with Writer(path, version=9, storage_plugin=storage) as writer:
+        for stamp_ns, topic, kind, raw in sorted(messages, key=lambda message: message[0]):
+            if topic not in connections:
+                connections[topic] = writer.add_connection(f'/{topic}', kind, typestore=TYPES)
+            writer.write(connections[topic], stamp_ns, raw)
+    return path
+
+
+def float_message(value: float) -> bytes:
+    return bytes(TYPES.serialize_cdr(TYPES.types[FLOAT](data=value), FLOAT))
+
+
+def multi_array(parts: Mapping[str, Sequence[float]]) -> bytes:
     dimension = TYPES.types['std_msgs/msg/MultiArrayDimension']
-    layout = TYPES.types['std_msgs/msg/MultiArrayLayout'](
-        dim=[dimension(label=label, size=1, stride=0) for label in labels], data_offset=0
-    )
-    message = TYPES.types[MULTI_ARRAY](layout=layout, data=np.array(values, dtype=np.float64))
-    return bytes(TYPES.serialize_cdr(message, MULTI_ARRAY))
+    layout = TYPES.types['std_msgs/msg/MultiArrayLayout'](dim=[
+        dimension(label=label, size=len(values), stride=0) for label, values in parts.items()
+    ], data_offset=0)
+    data = np.array([value for values in parts.values() for value in values], dtype=np.float64)
+    return bytes(TYPES.serialize_cdr(TYPES.types[MULTI_ARRAY](layout=layout, data=data),
+                                     MULTI_ARRAY))
 
 
 def rows_of(
@@ -39,8 +62,8 @@ def rows_of(
             continue
         known = dict(zip(COLUMNS, run.rows[k].tolist(), strict=True))
         known |= {'sample': float(k + first), 'latency_s': LATENCY_S, 'std_f': nan}
-        values = [known.get(prefix + label, known.get(label, nan)) for label in labels]
-        yield k, multi_array(labels, values)
+        yield k, multi_array({
+            label: [known.get(prefix + label, known.get(label, nan))] for label in labels})
 
 
 def write_bag(
@@ -49,35 +72,20 @@ def write_bag(
     unpaired: frozenset[int] = frozenset(), models: Mapping[int, bytes] = MappingProxyType({}),
 ) -> Path:
     """Write a bag as the recorder does; the last sample has no truth, its v was never applied."""
-    period_ns = round(run.sample_period * 1e9)
-    with Writer(path, version=9, storage_plugin=storage) as writer:
-        sources = [
-            (topics.SIGNALS, topics.SIGNAL_LABELS, lost, ''),
-            (topics.ESTIMATES, topics.ESTIMATE_LABELS, lost | unpaired, ''),
-        ]
-        if truth:
-            never_applied = frozenset({run.samples - 1})
-            sources.append((topics.TRUTH, topics.TRUTH_LABELS, never_applied, 'true_'))
-        for topic, labels, skipped, prefix in sources:
-            connection = writer.add_connection(
-                f'/{namespace}{topic}', MULTI_ARRAY, typestore=TYPES)
-            for k, raw in rows_of(run, labels, skipped, prefix):
-                writer.write(connection, 10**18 + k * period_ns, raw)
-        if models:
-            connection = writer.add_connection(
-                f'/{namespace}{topics.MODEL}', MULTI_ARRAY, typestore=TYPES)
-            for k, raw in models.items():
-                writer.write(connection, 10**18 + k * period_ns, raw)
-    return path
+    sources = [(topics.SIGNALS, topics.SIGNAL_LABELS, lost, ''),
+               (topics.ESTIMATES, topics.ESTIMATE_LABELS, lost | unpaired, '')]
+    if truth:
+        never_applied = frozenset({run.samples - 1})
+        sources.append((topics.TRUTH, topics.TRUTH_LABELS, never_applied, 'true_'))
+    rows = [(k, topic, raw) for topic, labels, skipped, prefix in sources
+            for k, raw in rows_of(run, labels, skipped, prefix)]
+    rows += [(k, topics.MODEL, raw) for k, raw in models.items()]
+    return write_messages(path, (
+        (10**18 + k * round(run.sample_period * 1e9), f'{namespace}{topic}', MULTI_ARRAY, raw)
+        for k, topic, raw in rows), storage)
 
 
-def believed(denominator: list[float], tail: int = 0) -> bytes:
-    """A message of controller/model; tail: numbers at its end that are missing."""
+def believed(denominator: list[float]) -> bytes:
     fields = LearnedModel((0.1,), tuple(denominator), 1, (0.1,) * 5, 1.2, 0.03).fields()
-    dimension = TYPES.types['std_msgs/msg/MultiArrayDimension']
-    layout = TYPES.types['std_msgs/msg/MultiArrayLayout'](dim=[
-        dimension(label=label, size=len(values), stride=0) for label, values in fields.items()
-    ], data_offset=0)
-    data = [value for values in fields.values() for value in values]
-    message = TYPES.types[MULTI_ARRAY](layout=layout, data=np.array(data[:len(data) - tail]))
-    return bytes(TYPES.serialize_cdr(message, MULTI_ARRAY))
+    label, values = list(fields.items())[-1]
+    return multi_array({**fields, label: values[:-1]})

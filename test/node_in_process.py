@@ -118,7 +118,6 @@ class Bench:
         return str(self.node._state_machine.current_state[1])
 
     def run(self, samples: int) -> None:
-        """Let so many sample periods pass."""
         for _ in range(samples):
             self.plant.step(self.sent[-1] if self.sent else self.v)
             self._k += 1
@@ -138,7 +137,6 @@ class Bench:
         wait_until(condition, what, self.serve)
 
     def ask(self, service: str, kind: type[Any], request: Any) -> Any:
-        """The answer of a service of the node."""
         client = self.probe.node.create_client(kind, f'/controller/{service}')
         self.wait_until(client.service_is_ready, service)
         answer = client.call_async(request)

@@ -35,7 +35,6 @@ class Truth(NamedTuple):
 
 
 def resonance(frequency_hz: float = 5.0, damping: float = 0.5) -> TransferFunction:
-    """G(z) of a load on a spring."""
     w = 2.0 * np.pi * frequency_hz
     continuous = ([w**2], [1.0, 2.0 * damping * w, w**2])
     numerator, denominator, _ = cont2discrete(continuous, PERIOD_S, 'zoh')
@@ -43,7 +42,6 @@ def resonance(frequency_hz: float = 5.0, damping: float = 0.5) -> TransferFuncti
 
 
 def swing(count: int, size: float = 3.0, seed: int = 0) -> Array:
-    """A smooth v of many frequencies, up to about `size`."""
     rng = np.random.default_rng(seed)
     t = PERIOD_S * np.arange(count)
     return size / 2.0 * sum(

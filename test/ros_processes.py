@@ -14,6 +14,7 @@ from contextlib import ExitStack, contextmanager
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 # Before rclpy reads it.
 os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
@@ -55,16 +56,9 @@ class ForkedNode:
             target=_run_node, daemon=True,
             args=(executable, list(arguments), stdout, stderr, dict(environment)),
         )
-        before = os.environ.get('BACKLASH_ROS_EVENTS')
         # The first start forks nothing yet, but does the imports, one of which reads this.
-        os.environ['BACKLASH_ROS_EVENTS'] = '1'
-        try:
+        with patch.dict(os.environ, BACKLASH_ROS_EVENTS='1'):
             self._process.start()
-        finally:
-            if before is None:
-                del os.environ['BACKLASH_ROS_EVENTS']
-            else:
-                os.environ['BACKLASH_ROS_EVENTS'] = before
 
     @property
     def pid(self) -> int:
@@ -139,13 +133,11 @@ class NodeProcess:
         return self._stdout.read_text()
 
     def events(self, kind: str) -> list[dict[str, Any]]:
-        """Events of this kind so far."""
         # The last piece may be a line that is still being written.
         lines = self._stdout.read_text().split('\n')[:-1]
         return [event for event in map(json.loads, lines) if event['event'] == kind]
 
     def wait_for(self, kind: str) -> dict[str, Any]:
-        """The first event of this kind."""
         wait_until(
             lambda: self.events(kind) or self.process.poll() is not None,
             f'{kind} of {self.executable}',
@@ -165,7 +157,6 @@ class NodeProcess:
         return self.process.wait(DEADLINE_S)
 
     def kill(self) -> None:
-        """Make sure that nothing is left."""
         if self.process.poll() is None:
             self.process.kill()
             self.process.wait()
@@ -183,7 +174,6 @@ class Probe:
         self._asked_at = 0.0
 
     def collect(self, topic: str, message_type: type[Any]) -> list[Any]:
-        """A list that grows with every message of the topic."""
         heard: list[Any] = []
         self.node.create_subscription(message_type, topic, heard.append, 1000)
         return heard
@@ -215,7 +205,6 @@ class Probe:
         self._executor.spin_once(timeout_sec=seconds)
 
     def close(self) -> None:
-        """Leave the domain."""
         self._executor.shutdown()
         self.node.destroy_node()
         rclpy.shutdown(context=self._context)
@@ -242,15 +231,12 @@ class RosWorld:
         for name, value in (parameters or {}).items():
             text = value if isinstance(value, str) else json.dumps(value)
             ros_arguments += ['-p', f'{name}:={text}']
-        process = NodeProcess(
-            executable, [*ros_arguments, *arguments], self.folder, self.environment,
-            self.forked,
-        )
+        process = NodeProcess(executable, [*ros_arguments, *arguments], self.folder,
+                              self.environment, self.forked)
         self._stack.callback(process.kill)
         return process
 
     def probe(self) -> Probe:
-        """A node of the test."""
         probe = Probe(self.domain)
         self._stack.callback(probe.close)
         return probe

@@ -52,7 +52,6 @@ def crc16(data: bytes) -> int:
 
 
 def packet(number: int, instruction: int, parameters: bytes) -> bytes:
-    """An instruction or a status as it is on the wire."""
     # A header within the packet is broken up by one more 0xfd.
     stuffed = (bytes((instruction,)) + parameters).replace(HEADER[:3], HEADER[:3] + b'\xfd')
     data = HEADER + struct.pack('<BH', number, len(stuffed) + 2) + stuffed
@@ -224,7 +223,6 @@ class Port:
         self._thread.start()
 
     def close(self) -> None:
-        """Pull the plug."""
         self._link.unlink(missing_ok=True)
         self._ends.set()
         self._thread.join()

@@ -58,7 +58,6 @@ class SimulatedLoop:
         return self.controller.loop
 
     def run(self, samples: int) -> None:
-        """Let so many sample periods pass."""
         driver = self.driver
         for _ in range(samples):
             before = driver.actuator.v

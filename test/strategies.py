@@ -123,6 +123,5 @@ class KnownInput:
         return self.u_hat
 
     def update(self, y: float) -> float:
-        """Take in u(k-1) and return it."""
         self.u_hat = y
         return y

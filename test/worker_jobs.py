@@ -17,7 +17,6 @@ def checksum(samples: ChannelSamples, factor: float) -> tuple[int, int, float]:
 
 
 def last_for_ever(begun: Path) -> None:
-    """Say that it is under way, and never end."""
     begun.touch()
     while True:
         time.sleep(60.0)

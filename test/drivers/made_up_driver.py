@@ -20,7 +20,6 @@ GOOD_GRAPH = Graph(publishers=1, types=(FLOAT64,), listeners=1)
 
 
 def model(period_s: float = PERIOD_S) -> tuple[list[float], list[float]]:
-    """G(z) of a load with 2 Hz and a damping of 0.5."""
     continuous = ([NATURAL**2], [1.0, NATURAL, NATURAL**2])
     numerator, denominator, _ = cont2discrete(continuous, period_s, 'zoh')
     return numerator[0, 1:].tolist(), denominator.tolist()
@@ -38,14 +37,12 @@ def parameters(**changes: object) -> dict[str, object]:
 
 
 def plant_parameters() -> Parameters:
-    """The plant behind the driver."""
     return Parameters(parameters(
         backlash__m=1.3, backlash__c_r=1.0, backlash__c_l=-0.8, output_noise_std=5e-4,
     ))
 
 
 def messages(values: list[float], offset: float, age_s: float = 1e-4) -> list[Message]:
-    """One message per sample, at a share `offset` of the period."""
     stamps = [START_NS + int((k + offset) * PERIOD_S * 1e9) for k in range(len(values))]
     return [
         Message(value, stamp, stamp + int(age_s * 1e9), k + 1)

@@ -58,7 +58,6 @@ class PacedDriver:
         self.output = probe.publisher(topics.PLANT_OUTPUT, Float64)
 
     def meet(self, controller: NodeProcess) -> None:
-        """Wait until the controller listens."""
         node = self.probe.node
         self.probe.wait_until(
             lambda: (
@@ -80,7 +79,6 @@ class PacedDriver:
         wait_until(condition, what, self._tick)
 
     def learn(self) -> None:
-        """Go on until the backlash is known for some time."""
         self.run_until_known(0.02)
         self.run(20)
         self.run_until_known(0.02)
@@ -115,7 +113,6 @@ class PacedDriver:
         return dict(zip(('m', 'c_r', 'c_l'), self.estimates[-1].data, strict=False))
 
     def error(self) -> float:
-        """The largest relative error of the newest estimate."""
         if not self.estimates:
             return 1.0
         estimate = self.estimate()

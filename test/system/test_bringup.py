@@ -64,7 +64,6 @@ print('last command', state['v'], flush=True)
 
 
 def foreign_driver(folder: Path) -> str:
-    """The command of such a driver, which dies of SIGUSR1."""
     script = folder / 'driver.py'
     script.write_text(FOREIGN)
     return shlex.join([sys.executable, str(script)])
@@ -133,8 +132,7 @@ def test_a_killed_controller_is_named_and_stops_every_axis_and_its_driver(start)
     session.wait_for_samples('pan: ')
     session.wait_for_samples('tilt: ')
     os.kill(session.node('controller', '/tilt'), signal.SIGKILL)
-    assert session.wait() == 1
-    assert session.survivors() == {}
+    assert (session.wait(), session.survivors()) == (1, {})
     assert 'tilt/controller died (killed by SIGKILL)' in session.stderr
     assert str(session.out / 'tilt' / 'logs' / 'controller.log') in session.stderr
     assert 'pan/' not in session.stderr
@@ -168,8 +166,7 @@ def test_a_driver_that_dies_is_named_with_its_last_words_and_the_run_is_reported
         if 'driver.py' in command and '--driver' not in command
     )
     os.kill(driver, signal.SIGUSR1)
-    assert session.wait() == 1
-    assert session.survivors() == {}
+    assert (session.wait(), session.survivors()) == (1, {})
     assert 'driver died (exit code 1)' in session.stderr
     assert f'{session.out}/logs/driver.log:\n    the fuse has blown' in session.stderr
     assert session.stderr.count('died') == 1

@@ -86,7 +86,6 @@ class World:
         )
 
     def stop(self) -> str:
-        """End the driver; returns its log."""
         self.driver.terminate()
         assert self.driver.wait(DEADLINE_S) == 0, self.log.read_text()
         return self.log.read_text()

@@ -38,19 +38,16 @@ def start_driver(world: RosWorld) -> None:
 
 
 def start(world: RosWorld, *options: str) -> NodeProcess:
-    """Start check_driver with the parameters of the plant."""
     return world.start('check_driver', None, '--config', str(world.folder / 'driver.yaml'),
                        '--duration', '6', *options)
 
 
 def check(world: RosWorld, *options: str) -> tuple[int, str]:
-    """Run check_driver; return its exit code and what it printed."""
     process = start(world, *options)
     return process.wait(), process.stdout + process.stderr
 
 
 def subjects(told: str, mark: str) -> set[str]:
-    """What the lines with this mark are about."""
     return {line[2:].split('  ')[0].strip() for line in told.splitlines() if line.startswith(mark)}
 
 

@@ -2,9 +2,11 @@
 
 import os
 import signal
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
+import psutil
 from drivers.paced_driver import controller_and_driver
 from ros_processes import NodeProcess, ros_world
 from waiting import wait_until
@@ -18,15 +20,10 @@ UNCERTAIN: dict[str, object] = {'plant.uncertainty': 0.2}
 def workers_of(controller: NodeProcess) -> list[int]:
     """Process ids of the workers that a controller has started and that still run."""
     found = []
-    for folder in Path('/proc').glob('[0-9]*'):
-        try:
-            state, parent = (folder / 'stat').read_text().rpartition(')')[2].split()[:2]
-            command = (folder / 'cmdline').read_bytes()
-        except OSError:  # it has ended meanwhile
-            continue
-        is_child = int(parent) == controller.process.pid and state != 'Z'
-        if is_child and worker.__name__.encode() in command:
-            found.append(int(folder.name))
+    for child in psutil.Process(controller.process.pid).children():
+        with suppress(psutil.Error):  # it has ended meanwhile
+            if worker.__name__ in ' '.join(child.cmdline()):
+                found.append(child.pid)
     return found
 
 

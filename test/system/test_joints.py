@@ -61,7 +61,6 @@ class Arm:
         self.probe.spin(0.02)
 
     def send(self, y: Mapping[str, float]) -> None:
-        """Send the states of the next sample."""
         stamp_ns = self.stamp_ns(self.k)
         self.k += 1
         self._states.publish(JointState(
@@ -70,7 +69,6 @@ class Arm:
         ))
 
     def answer(self, y: Mapping[str, float]) -> JointState | Float64MultiArray:
-        """Send states; returns the commands for them."""
         before = len(self.commands)
         self.send(y)
         self.probe.wait_until(lambda: len(self.commands) > before, 'an answer')
@@ -112,8 +110,7 @@ def test_every_joint_is_answered_by_its_own_loop_in_one_message(tmp_path: Path) 
             it.refer(reference(k))
             answers.append(it.answer(output(k)))
         for answer in answers:
-            assert list(answer.name) == JOINTS
-            assert list(answer.velocity) == [0.5] * 3  # passed through
+            assert (list(answer.name), list(answer.velocity)) == (JOINTS, [0.5] * 3)
         # Nobody has described the gripper.
         assert answers[-1].position[2] == pytest.approx(reference(7)['gripper'], abs=1e-12)
         it.probe.wait_until(lambda: len(it.signals) >= 8, 'signals')
@@ -143,8 +140,7 @@ def test_an_array_has_the_commands_of_all_joints_in_their_order(tmp_path: Path) 
         for k in range(1, 4):
             it.refer(reference(k))
             answer = it.answer(output(k))
-        assert len(answer.data) == 3
-        assert len(it.commands) == 3
+        assert (len(answer.data), len(it.commands)) == (3, 3)
         assert answer.data[2] == pytest.approx(reference(3)['gripper'], abs=1e-12)
 
 

@@ -19,7 +19,6 @@ MODULE = 'live'
 
 @pytest.fixture(scope='module')
 def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
-    """A run of two axes without end, with its page."""
     with bringup_sessions(tmp_path_factory.mktemp('live')) as start_session:
         session = start_session(
             '--config', 'two_axes.yaml', '--duration', 'inf', '--no-record', '--live',
@@ -43,9 +42,7 @@ def test_alone_it_waits_for_a_controller_and_ends_with_ctrl_c(tmp_path: Path) ->
         taken = world.start(MODULE, None, '--port', port)
         assert taken.wait() == 2
         assert taken.stderr.startswith(f'live: --port={port}: Address already in use')
-        assert len(taken.stderr.splitlines()) == 1
-        assert live.stop() == 0
-        assert live.stderr == ''
+        assert (len(taken.stderr.splitlines()), live.stop(), live.stderr) == (1, 0, '')
 
 
 def test_a_page_shows_every_axis_to_this_machine_alone_and_a_run_goes_on_without_it(run):
@@ -76,5 +73,4 @@ def test_a_page_shows_every_axis_to_this_machine_alone_and_a_run_goes_on_without
     wait_until(lambda: len(run.stderr.splitlines()) > lines, 'progress')
     run.process.send_signal(signal.SIGINT)
     assert run.wait() == 0, run.stderr
-    assert run.stderr.count(said) == 1
-    assert run.survivors() == {}
+    assert (run.stderr.count(said), run.survivors()) == (1, {})

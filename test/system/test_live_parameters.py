@@ -22,7 +22,6 @@ class Client:
         probe.wait_until(self._client.services_are_ready, f'the parameters of {node}')
 
     def change(self, **values: Any) -> Any:
-        """The answer; __ stands for a dot."""
         parameters = [
             Parameter(name.replace('__', '.'), value=value) for name, value in values.items()
         ]
@@ -99,11 +98,9 @@ def test_what_was_dumped_is_complete_and_loads_without_a_change(tmp_path: Path) 
             file = parameter_file(tmp_path / f'{name}.yaml', name, before)
             loaded = probe.ask(lambda c=client, f=file: c.load_parameter_file(f, True), 'an answer')
             assert [r.reason for r in loaded.results if not r.successful] == []
-            assert dumped(probe, name) == before
-            assert node.stop() == 0
+            assert (dumped(probe, name), node.stop()) == (before, 0)
             # Who asks before the graph has forgotten it is never answered.
             probe.wait_until(lambda c=client: not c.services_are_ready(), 'its end')
             # A node that starts with it is the same one.
             again = world.start(name, None, '--ros-args', '--params-file', file)
-            assert dumped(probe, name) == before
-            assert again.stop() == 0
+            assert (dumped(probe, name), again.stop()) == (before, 0)

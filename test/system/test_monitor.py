@@ -42,7 +42,6 @@ class Screen:
         )
 
     def read(self) -> None:
-        """Take in what has been written."""
         try:
             while part := os.read(self._master, 65536):
                 self.output += part.decode(errors='replace')
@@ -50,7 +49,6 @@ class Screen:
             pass
 
     def frame(self) -> str:
-        """The newest picture that is complete."""
         self.read()
         pictures = self.output.split(HOME)
         return ESCAPES.sub('', pictures[-2]) if len(pictures) > 2 else ''
@@ -59,7 +57,6 @@ class Screen:
         os.write(self._master, keys.encode())
 
     def wait(self) -> int:
-        """Exit code of a monitor that ends by itself."""
         code = self.process.wait(DEADLINE_S)
         self.read()
         return code
@@ -69,7 +66,6 @@ class Screen:
         return termios.tcgetattr(self._slave) == self._before and LEAVE_SCREEN in self.output
 
     def close(self) -> None:
-        """Make sure that nothing is left."""
         if self.process.poll() is None:
             self.process.kill()
             self.process.wait()
@@ -162,5 +158,4 @@ def test_it_waits_until_ctrl_c_and_prints_plain_lines_without_a_terminal(tmp_pat
         )
         driver.run_until(lambda: line.search(monitor.stdout), 'the line')
         assert '\x1b' not in monitor.stdout
-        assert monitor.stop() == 0
-        assert monitor.stderr == ''
+        assert (monitor.stop(), monitor.stderr) == (0, '')

@@ -24,7 +24,6 @@ class Stage:
         self._diagnostics = self.driver.probe.collect(topics.DIAGNOSTICS, DiagnosticArray)
 
     def start(self, name: str) -> NodeProcess:
-        """A controller with a name of its own."""
         # The topics of both keep the names under which the driver listens.
         same = [
             part for topic in (topics.ESTIMATES, topics.SIGNALS)
@@ -49,7 +48,6 @@ class Stage:
         self.driver.run_until(condition, what)
 
     def samples(self, name: str) -> int:
-        """Commands that a controller has sent."""
         status = self.status(name)
         values = {each.key: each.value for each in status.values} if status else {}
         return int(values.get('samples', 0))

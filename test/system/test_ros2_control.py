@@ -35,7 +35,6 @@ class StandIn:
         driver.sent = self._send
 
     def meet(self) -> None:
-        """Wait until the controller listens."""
         self.driver.probe.wait_until(
             lambda: self._states.get_subscription_count() > 0
             and self.driver.reference.get_subscription_count() > 0
@@ -91,8 +90,7 @@ def test_the_loop_through_ros2_control_is_learned_recorded_and_reported(tmp_path
         driver.run_until(lambda: driver.says('2 publishers of joint_states'), 'a word about them')
         driver.run(50)
         driver.run_until_known(0.02)
-        assert controller.stop() == 0
-        assert recorder.stop() == 0
+        assert (controller.stop(), recorder.stop()) == (0, 0)
         recorded = recorder.wait_for('closed')['messages']
         assert recorded[f'/{topics.JOINT_STATES}'] > 20
         assert recorded[f'/{topics.JOINT_COMMANDS}'] > 20

@@ -34,7 +34,6 @@ def samples_of(law: str, structure: str, condition: str) -> list[Sample]:
 
 @cache
 def asked_by_the_reference(structure: str, condition: str) -> float:
-    """Largest |u_d| of a loop that knows a plant without a gap."""
     changes = {
         **CONDITIONS[condition].changes, 'backlash.c_r': 1e-9, 'backlash.c_l': -1e-9,
         'estimator.initial.m': 1.3, 'estimator.initial.c_r': 0.0, 'estimator.initial.c_l': 0.0,

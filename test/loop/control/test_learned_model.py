@@ -118,7 +118,6 @@ TRUTH = Estimate(0.098, 0.55, -0.35, 0.0)
 
 
 def motor(scale: float = 1.0, damping: float = 0.5, delay: int = 0) -> TransferFunction:
-    """Second order with 20 Hz times scale, and samples of delay."""
     w = 40.0 * pi * scale
     numerator, denominator, _ = cont2discrete(
         ([w * w], [1.0, 2.0 * damping * w, w * w]), PERIOD, 'zoh'

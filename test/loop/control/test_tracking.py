@@ -235,8 +235,7 @@ def test_delay_counts_sample_periods_where_samples_were_lost() -> None:
 
 def test_turns_counts_what_turns_back_by_more_than_the_least() -> None:
     assert turns(np.array([0.0, 2.0, 0.0, 2.0, 1.5, 3.0]), 1.0) == 2
-    assert turns(np.array([0.0, 2.0, 1.5, 2.0]), 1.0) == 0
-    assert turns(np.empty(0), 1.0) == 0
+    assert (turns(np.array([0.0, 2.0, 1.5, 2.0]), 1.0), turns(np.empty(0), 1.0)) == (0, 0)
 
 
 def test_crossings_are_counted_per_reversal_of_the_reference() -> None:

@@ -1,8 +1,8 @@
 """Sequences of faults as benchmarks/faults.py plays them, interruptions, drivers that are slow."""
 
 import pytest
+from fault_loop.fault_controller import blamed
 from fault_loop.fault_sequences import Sequence
-from fault_loop.sound_driver import blamed
 
 from backlash_ros.core.loop.control_loop import ControlLoop, Driver
 from backlash_ros.core.loop.sample_counter import Output, SampleCounter

@@ -86,10 +86,3 @@ def test_a_thousand_faults_of_a_joint_change_no_command_of_another_by_a_bit() ->
     # A sensor that has nothing to say is not answered, one that lies is.
     unanswered = sum(map(isnan, beside['elbow']))
     assert unanswered == sum(fault != 3 for fault in faults.values())
-
-
-def test_a_joint_in_an_arm_is_the_loop_that_it_is_alone() -> None:
-    together = run(lambda k, y: y, 400)
-    for joint in JOINTS:
-        one = run(lambda k, y, joint=joint: {joint: y[joint]}, 400)  # type: ignore[misc]
-        assert one[joint] == together[joint]

@@ -5,7 +5,7 @@ from math import sin
 
 import numpy as np
 import pytest
-from cases.geared_motor import motor
+from cases.loops import motor
 from contract.judged import judged
 from contract.learning_rows import PAPER as EXACT
 from contract.learning_rows import Job, Outcome, changes_jobs, run_job

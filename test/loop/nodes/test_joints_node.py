@@ -47,7 +47,6 @@ class Arm:
         return [joint for commands in self.sent[before:] for joint in commands]
 
     def commanded(self, y_m: float) -> dict[str, float]:
-        """v of all joints after some samples with this reference."""
         self.node._on_reference(dict.fromkeys(JOINTS, y_m))
         for _ in range(10):
             self.hear(AT_ZERO)
@@ -90,8 +89,7 @@ def test_an_arm_that_has_lost_a_joint_stops_as_one_or_goes_on_as_told(together: 
         made.lose('gripper')
         for lost in (others, {**others, 'gripper': nan}):
             assert made.hear(lost) == ([] if together else ['waist', 'elbow'])
-        assert made.hear(AT_ZERO) == list(JOINTS)
-        assert made.hear(AT_ZERO) == list(JOINTS)
+        assert (made.hear(AT_ZERO), made.hear(AT_ZERO)) == (list(JOINTS), list(JOINTS))
 
 
 def test_references_are_held_and_those_that_say_nothing_are_passed_over() -> None:

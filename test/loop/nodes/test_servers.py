@@ -67,13 +67,11 @@ class Loop:
         wait_until(condition, what, lambda: self.executor.spin_once(timeout_sec=0.02))
 
     def say(self, *values: float) -> None:
-        """Publish to whoever has been found."""
         self.spin_until(self.publisher.get_subscription_count, 'a subscriber')
         for value in values:
             self.publisher.publish(Float64(data=value))
 
     def close(self) -> None:
-        """Leave the domain."""
         self.executor.shutdown()
         self.node.destroy_node()
         rclpy.shutdown(context=self.context)

@@ -68,7 +68,6 @@ def make(*arguments: str, cwd: Path, **environment: str) -> subprocess.Completed
 
 @pytest.fixture
 def bare_clone(tmp_path: Path) -> Path:
-    """What make needs to create an environment, without one."""
     for name in ('Makefile', 'setup.py', 'setup.cfg'):
         shutil.copy(ROOT / name, tmp_path)
     for name in ('scripts', 'requirements'):

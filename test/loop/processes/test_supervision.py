@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from bringup_processes import DEADLINE_S, marked_processes, wait_until
+from bringup_processes import DEADLINE_S, MARK, marked_processes, wait_until
 
 from backlash_ros.tools.bringup import supervisor as supervising
 from backlash_ros.tools.bringup import watch as watching
@@ -50,7 +50,7 @@ def watch(
 ) -> Iterator[Callable[..., Watched]]:
     """Run bringup's loop over Python programs given by name; none of them is left at the end."""
     mark = uuid.uuid4().hex
-    monkeypatch.setenv('BACKLASH_TEST_RUN', mark)
+    monkeypatch.setenv(MARK, mark)
 
     def watch_programs(hurry: bool = False, **programs: str) -> Watched:
         parameters = effective_parameters(None).replaced({'samples': 100})

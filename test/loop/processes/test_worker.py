@@ -8,9 +8,11 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 from places import ROOT
 from waiting import wait_until
@@ -44,7 +46,6 @@ def executor() -> Iterator[WorkerExecutor]:
 
 
 def result_of(channel: Channel) -> object:
-    """The result of a job, when it has come."""
     assert channel.busy
     results: list[object] = []
 
@@ -58,10 +59,9 @@ def result_of(channel: Channel) -> object:
 
 def is_there(pid: int) -> bool:
     """Whether a process runs, which a zombie does not."""
-    try:
-        return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0] != 'Z'
-    except (FileNotFoundError, ProcessLookupError):
-        return False
+    with suppress(psutil.NoSuchProcess):
+        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+    return False
 
 
 def begin(channel: Channel, begun: Path) -> None:
@@ -134,8 +134,7 @@ def test_a_worker_that_is_killed_costs_nothing_but_the_job_under_way(executor, t
         assert failure.kind == LOST
         # What is appended while there is no worker belongs to the record, not to the job before.
         channel.append(7.0)
-        assert result_of(third) == -count
-        assert result_of(channel) == checksum(expected, 1.0)
+        assert (result_of(third), result_of(channel)) == (-count, checksum(expected, 1.0))
         values.append(7.0)
         assert executor.restarts == count
         assert executor.alive

@@ -19,8 +19,7 @@ def test_document_and_figure_come_from_one_command(tmp_path, capsys):
 
 
 def test_bad_input_ends_with_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(['--set', 'amplitud=3']) == 2
-    assert capsys.readouterr().err.count('\n') == 1
+    assert (main(['--set', 'amplitud=3']), capsys.readouterr().err.count('\n')) == (2, 1)
 
 
 def test_learned_backlash_costs_less_than_an_uncompensated_one() -> None:

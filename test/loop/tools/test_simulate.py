@@ -9,6 +9,7 @@ import sys
 from math import inf
 from pathlib import Path
 
+import psutil
 import pytest
 from places import ROOT
 from waiting import DEADLINE_S, wait_until
@@ -105,8 +106,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     err = capsys.readouterr().err
     assert message in err
     assert err.startswith('simulate: ')
-    assert err.count('\n') == 1
-    assert list(tmp_path.iterdir()) == []
+    assert (err.count('\n'), list(tmp_path.iterdir())) == (1, [])
 
 
 def outcome(error: float, settling: float | None) -> Outcome:
@@ -121,8 +121,7 @@ def test_statistics_are_those_of_the_errors() -> None:
     m = of['m']
     assert m.bias == pytest.approx(0.0, abs=1e-15)
     assert m.rmse == pytest.approx((9.5 / 3) ** 0.5 * 0.01)
-    assert (m.settling_median, m.settling_max) == (2.0, inf)
-    assert m.within == pytest.approx(2 / 3)  # 1 % of 2 is 0.02
+    assert (m.settling_median, m.settling_max, m.within) == (2.0, inf, pytest.approx(2 / 3))
     assert of['c_r'].within == 1.0
 
 
@@ -165,10 +164,6 @@ def is_gone(group: int) -> bool:
     return False
 
 
-def children(pid: int) -> list[str]:
-    return Path(f'/proc/{pid}/task/{pid}/children').read_text().split()
-
-
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_interrupted_seeds_end_at_once_with_one_line(tmp_path: Path, number: int) -> None:
     command = [sys.executable, '-m', 'backlash_ros.tools.simulate', '--seeds', '4',
@@ -178,13 +173,12 @@ def test_interrupted_seeds_end_at_once_with_one_line(tmp_path: Path, number: int
     try:
         # The first child only keeps track of shared resources; a worker may still be starting,
         # which is the worst moment.
-        wait_until(lambda: len(children(process.pid)) > 1, 'the start of a worker')
+        wait_until(lambda: len(psutil.Process(process.pid).children()) > 1, 'the start of a worker')
         # A terminal sends Ctrl-C to the whole group, a supervisor SIGTERM to the parent alone.
         send = os.killpg if number == signal.SIGINT else os.kill
         send(process.pid, number)
         _, err = process.communicate(timeout=DEADLINE_S)
-        assert process.returncode == 1
-        assert err == 'simulate: interrupted\n'
+        assert (process.returncode, err) == (1, 'simulate: interrupted\n')
         wait_until(lambda: is_gone(process.pid), 'the end of every process')
     finally:
         if not is_gone(process.pid):

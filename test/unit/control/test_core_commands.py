@@ -20,7 +20,6 @@ from backlash_ros.core.plant.backlash import Backlash
 def as_printed(
     u_d: float, u_d_before: float, v_before: float, m: float, c_r: float, c_l: float,
 ) -> float:
-    """The three cases of (2.3), word for word."""
     if u_d == u_d_before:
         return v_before
     if u_d < u_d_before:
@@ -92,7 +91,6 @@ def test_what_others_tell_of_v_leads_it_no_further_out(told, known, begins):
 
 
 def sent(limits: Limits, targets: list[float], v: float = 0.0) -> list[float]:
-    """v before and after each target."""
     motion, commands = at_rest(v), [v]
     for target in targets:
         motion = limits.apply(target, motion)

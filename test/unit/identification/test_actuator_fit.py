@@ -32,7 +32,6 @@ NOISE, SAMPLES = 1e-4, 2400
 
 @lru_cache
 def record() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Commands, motor encoder with noise, y."""
     plant, rng, rows = build_plant(TRUE), np.random.default_rng(2), []
     for command in islice(strokes(-1.0, 1.0, 4.0, PERIOD, SAMPLES * PERIOD, 0.0), SAMPLES):
         y = plant.measure()

@@ -56,8 +56,7 @@ def test_all_files_are_written_with_the_numbers_of_the_actuator(result: Path) ->
     }
     found = json.loads((result / 'identified.json').read_text())
     assert found['usable'] is True
-    assert found['reasons'] == []
-    assert found['m'] == 0.5
+    assert (found['reasons'], found['m']) == ([], 0.5)
     for name, true in (('gap', 0.9), ('c_r', 0.5), ('c_l', -0.4)):
         assert abs(found[name] - true) < 4.0 * found['std'][name] < 0.05
     assert found['delay_samples'] == 1
@@ -74,10 +73,8 @@ def test_the_file_is_a_complete_configuration(result: Path) -> None:
     assert parameters.control.delay_samples == numbers['delay_samples']
     assert parameters.plant.uncertainty == numbers['uncertainty']
     # What was given stays, but for the plant that is simulated.
-    assert parameters.control.rate_max == 40.0
-    assert parameters.on_stop == 'zero'
-    assert parameters.backlash.m == 0.5
-    assert parameters.input_disturbance == 0.0
+    assert (parameters.control.rate_max, parameters.on_stop) == (40.0, 'zero')
+    assert (parameters.backlash.m, parameters.input_disturbance) == (0.5, 0.0)
     build_controller(parameters)
 
 
@@ -114,8 +111,7 @@ def test_a_record_of_no_use_is_told_and_leaves_no_parameter_file(tmp_path, capsy
 def test_bad_options_are_told_in_one_line(tmp_path, monkeypatch, capsys, arguments):
     monkeypatch.chdir(tmp_path)
     write_csv(tmp_path / 'a.csv', *record(100))
-    assert main(arguments) == 2
-    assert capsys.readouterr().err.count('\n') == 1
+    assert (main(arguments), capsys.readouterr().err.count('\n')) == (2, 1)
 
 
 def test_a_span_is_cut_out(tmp_path: Path) -> None:

@@ -28,7 +28,6 @@ PLANTS: dict[str, tuple[list[float], list[float]]] = {
 
 
 def play(v: Array, gap: Array | float) -> Array:
-    """Of one width, or of one for each sample."""
     place, out = float(v[0]), []
     for value, half in np.broadcast(v, 0.5 * np.asarray(gap)):
         place = min(max(place, value - half), value + half)
@@ -41,7 +40,6 @@ def dead_zone(v: Array) -> Array:
 
 
 def sticking(v: Array, band: float = 0.9, jump: float = 0.4) -> Array:
-    """Static friction above the sliding one, by its forces."""
     place, out = float(v[0]), []
     for value in v.tolist():
         if abs(value - place) > 0.5 * (band + jump):
@@ -51,7 +49,6 @@ def sticking(v: Array, band: float = 0.9, jump: float = 0.4) -> Array:
 
 
 def behind(u: Array, plant: str, noise: float = NOISE) -> Array:
-    """y of a plant that was at rest before."""
     numerator, denominator = PLANTS[plant]
     if plant == 'integrator':
         y = lfilter(numerator, denominator, u - u.mean())
@@ -174,5 +171,4 @@ def test_a_gap_on_a_part_of_the_way_is_told_though_none_fits_best() -> None:
     family = LinearFamily(V, behind(play(V, width), 'lag'))
     gaps, _ = family.changing(0.0, np.array([
         np.interp(V, np.linspace(V.min(), V.max(), 5), row) for row in np.eye(5)]))
-    assert gaps.argmax() == 2
-    assert gaps[2] == pytest.approx(0.4, abs=0.1)
+    assert (gaps.argmax(), gaps[2]) == (2, pytest.approx(0.4, abs=0.1))

@@ -31,7 +31,6 @@ SAMPLES = Samples(np.zeros(2), np.full(2, np.nan), 1, 2, 0.0)
 
 
 def model_of(integrator: bool, poles: list[complex], zeros: list[complex]) -> Model:
-    """A model with these roots; poles: without the integrator."""
     structure = Structure(len(poles) + integrator, 0, integrator)
     a = np.real(np.poly(poles))[1:] if poles else np.empty(0)
     b = np.zeros(structure.numerator_taps)
@@ -105,7 +104,6 @@ def test_a_delay_beyond_those_that_are_compared_first_is_found() -> None:
 
 
 def std_of_gap(noise: np.ndarray) -> tuple[float, float]:
-    """By the correlated residual and by the posterior."""
     v = np.sin(0.05 * np.arange(len(noise)))
     y = lfilter([0.0, 0.3], [1.0, -0.7], play(v, 0.3, 0.1)) + noise
     samples, structure = Samples(v, y, 1, len(v), 0.0), Structure(1, 0, False)

@@ -135,7 +135,6 @@ def reconstructed(
 
 def error(model: TransferFunction, noise_std: float = 0.0, lag: int = LAG,
           lost: tuple[int, ...] = (), samples: int = 400) -> Array:
-    """u_hat(k) - u(k) from k = 2 lag on, as long as y reaches."""
     u = play_output(samples)
     u_hat = reconstructed(InputReconstruction(model, noise_std, lag), output_of(model, u), lost)
     return (u_hat - u)[2 * lag: samples - lag]

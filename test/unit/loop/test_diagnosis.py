@@ -206,8 +206,7 @@ def test_what_the_fit_has_found_goes_before_what_may_be_missing() -> None:
 ])
 def test_a_wrong_sign_is_named_before_what_it_or_a_busy_machine_leads_to(changes):
     found = findings_of(replace(INCONSISTENT, report=LawReport(wrong_sign=True), **changes))
-    assert found[0].kind == 'model'
-    assert len(found) == 2
+    assert (found[0].kind, len(found)) == ('model', 2)
 
 
 def test_a_rival_whose_name_is_not_known_yet_is_no_line_of_the_log_at_once() -> None:

@@ -45,10 +45,8 @@ def noted(values: list[float], still_band: float = 0.0) -> LoopStatistics:
 
 def test_a_y_that_moves_within_its_noise_stands_still() -> None:
     noise = (1e-3 * np.random.default_rng(1).normal(size=100)).tolist()
-    assert noted(noise).still == 1
-    assert noted(noise, 6e-3).still == 100
-    assert noted(noise, 6e-3).still_swing == 4.0
-    assert noted([*noise, 0.1], 6e-3).still == 1
+    assert (noted(noise).still, noted(noise, 6e-3).still) == (1, 100)
+    assert (noted(noise, 6e-3).still_swing, noted([*noise, 0.1], 6e-3).still) == (4.0, 1)
 
 
 def test_an_angle_that_wraps_is_told_from_one_that_moves_fast() -> None:

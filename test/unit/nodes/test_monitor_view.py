@@ -39,7 +39,6 @@ def controller(
 
 
 def shown(states: list[ControllerState], **changes: object) -> list[str]:
-    """The lines on a terminal of 80 columns and 24 lines."""
     console = Console(file=StringIO(), width=80, height=24, force_terminal=False)
     arguments = {'selected': 0, 'notice': '', 'now_s': 100.5, 'width': 80, 'height': 24, **changes}
     console.print(screen(states, **arguments))  # type: ignore[arg-type]
@@ -51,8 +50,7 @@ def test_a_bar_ends_at_the_value_and_shades_the_band() -> None:
     assert bar(5.0, 1.0, 10.0, 10) == '████▒▒····'
     assert bar(-5.0, nan, 10.0, 10) == '█████·····'
     assert bar(5.0, 1e-9, 10.0, 10) == '████▒·····'
-    assert bar(0.0, 1e-9, 10.0, 10) == '▒·········'
-    assert bar(nan, 1.0, 10.0, 10) == ' ' * 10
+    assert (bar(0.0, 1e-9, 10.0, 10), bar(nan, 1.0, 10.0, 10)) == ('▒·········', ' ' * 10)
 
 
 def test_state_estimates_and_figures_are_shown() -> None:
@@ -92,8 +90,7 @@ def test_a_text_in_which_only_figures_change_is_one_event() -> None:
 
 def test_who_says_nothing_any_more_is_silent() -> None:
     state = controller()
-    assert state.word(102.0) == 'tracking'
-    assert state.word(107.2) == 'silent for 7 s'
+    assert (state.word(102.0), state.word(107.2)) == ('tracking', 'silent for 7 s')
     assert ControllerState('/controller').word(inf) == 'no diagnostics yet'
 
 

@@ -23,7 +23,6 @@ PARAMETERS = {
 
 
 def response_to(commands: list[float]) -> np.ndarray:
-    """y of the simulated plant."""
     plant = build_plant(Parameters({
         **PARAMETERS, 'plant.numerator': (0.3, 0.2), 'plant.denominator': (1.0, -0.6, 0.1),
         'backlash.m': 1.0, 'backlash.c_r': 1.0, 'backlash.c_l': -0.5,
@@ -42,7 +41,6 @@ def test_a_command_beyond_its_crossing_moves_y_and_within_does_not() -> None:
     top = c_r + 1.0
 
     def rests_at(lowest: float) -> float:
-        """y after a slow way up to the top and down from there."""
         ways = [(0.0, top), (top, top), (top, lowest), (lowest, lowest)]
         commands = [np.linspace(a, b, 400) for a, b in ways]
         return float(response_to(np.concatenate(commands).tolist())[-1])

@@ -43,8 +43,7 @@ def test_clamp_equals_the_three_printed_cases(m, c_l, gap, u, signal):
         expected, region = as_printed(
             expected, Fraction(v), Fraction(m), Fraction(c_l + gap), Fraction(c_l)
         )
-        assert backlash.step(v) == expected
-        assert backlash.region == region
+        assert (backlash.step(v), backlash.region) == (expected, region)
 
 
 values = st.floats(-10.0, 10.0)

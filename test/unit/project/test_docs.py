@@ -195,7 +195,6 @@ def test_commands_that_need_no_ros_run(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def blocks(*languages: str) -> list[str]:
-    """The text of each block of these languages, of all pages."""
     return [
         text for page in PAGES for language, text in BLOCK.findall(page.read_text())
         if language in languages
@@ -203,7 +202,6 @@ def blocks(*languages: str) -> list[str]:
 
 
 def python_snippets() -> list[str]:
-    """Blocks of Python, and what shell blocks hand to `python -c`."""
     return blocks('python') + [
         snippet for text in blocks('bash', 'sh', 'ini') for snippet in PYTHON_C.findall(text)
     ]

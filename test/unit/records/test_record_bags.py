@@ -6,16 +6,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from made_bags import FLOAT, MULTI_ARRAY, TYPES, write_messages
 from numpy.typing import NDArray
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
 
 from backlash_ros import topics
 from backlash_ros.tools.cli import InputError
 from backlash_ros.tools.records.reading import read_record
 
-TYPES = get_typestore(Stores.ROS2_JAZZY)
-NUMBER, NUMBERS = 'std_msgs/msg/Float64', 'std_msgs/msg/Float64MultiArray'
+NUMBER, NUMBERS = FLOAT, MULTI_ARRAY
 JOINTS = 'sensor_msgs/msg/JointState'
 PERIOD_NS = 5_000_000
 COUNT = 200
@@ -43,13 +41,10 @@ Topic = tuple[str, NDArray[np.int64], Sequence[Any]]  # type, stamps, values
 
 
 def bag(path: Path, heard: dict[str, Topic]) -> Path:
-    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        for name, (kind, stamps, values) in heard.items():
-            connection = writer.add_connection(name, kind, typestore=TYPES)
-            for stamp, value in zip(stamps.tolist(), values, strict=True):
-                raw = TYPES.serialize_cdr(message(kind, value), kind)
-                writer.write(connection, stamp, bytes(raw))
-    return path
+    return write_messages(path, (
+        (stamp, name, kind, bytes(TYPES.serialize_cdr(message(kind, value), kind)))
+        for name, (kind, stamps, values) in heard.items()
+        for stamp, value in zip(stamps.tolist(), values, strict=True)))
 
 
 LATER = STAMPS + 500_000
@@ -57,21 +52,21 @@ TWO = [{'shoulder': 7.0, 'elbow': y} for y in Y]
 ONE = [{'elbow': y} for y in Y]
 COMMANDS: dict[str, tuple[dict[str, Topic], str]] = {
     'an array of one': (
-        {'/joint_states': (JOINTS, STAMPS, ONE),
-         '/forward_command_controller/commands': (NUMBERS, LATER, [[v] for v in V])}, ''),
+        {'joint_states': (JOINTS, STAMPS, ONE),
+         'forward_command_controller/commands': (NUMBERS, LATER, [[v] for v in V])}, ''),
     'an array, several joints': (
-        {'/joint_states': (JOINTS, STAMPS, TWO),
-         '/forward_command_controller/commands': (NUMBERS, LATER, [[v] for v in V])}, 'elbow'),
+        {'joint_states': (JOINTS, STAMPS, TWO),
+         'forward_command_controller/commands': (NUMBERS, LATER, [[v] for v in V])}, 'elbow'),
     'joint states as commands': (
-        {'/joint_states': (JOINTS, STAMPS, TWO),
-         '/robot_joint_command': (JOINTS, LATER, [{'elbow': v, 'shoulder': 3.0} for v in V])},
+        {'joint_states': (JOINTS, STAMPS, TWO),
+         'robot_joint_command': (JOINTS, LATER, [{'elbow': v, 'shoulder': 3.0} for v in V])},
         'elbow'),
     'a number': (
-        {'/joint_states': (JOINTS, STAMPS, ONE), '/elbow/command': (NUMBER, LATER, V),
-         '/temperature': (NUMBER, LATER, V)}, ''),
+        {'joint_states': (JOINTS, STAMPS, ONE), 'elbow/command': (NUMBER, LATER, V),
+         'temperature': (NUMBER, LATER, V)}, ''),
     'a namespace': (
-        {'/arm/joint_states': (JOINTS, STAMPS, ONE),
-         '/arm/position_controller/commands': (NUMBERS, LATER, [[v] for v in V])}, ''),
+        {'arm/joint_states': (JOINTS, STAMPS, ONE),
+         'arm/position_controller/commands': (NUMBERS, LATER, [[v] for v in V])}, ''),
 }
 
 
@@ -79,16 +74,15 @@ COMMANDS: dict[str, tuple[dict[str, Topic], str]] = {
 def test_joint_states_and_commands_are_y_and_v(tmp_path: Path, name: str) -> None:
     heard, joint = COMMANDS[name]
     record = read_record(bag(tmp_path / 'bag', heard), axis=joint)
-    assert record.sample_period == pytest.approx(0.005)
-    assert record.v.tolist() == V.tolist()
+    assert (record.sample_period, record.v.tolist()) == (pytest.approx(0.005), V.tolist())
     assert record.y.tolist() == Y.tolist()
     assert 'y is' in record.notes[0]
 
 
 def test_of_several_joints_one_is_asked_for_and_may_be_named(tmp_path: Path) -> None:
     path = bag(tmp_path / 'bag', {
-        '/joint_states': (JOINTS, STAMPS, TWO),
-        '/commands': (NUMBERS, LATER, [[3.0, v] for v in V]),
+        'joint_states': (JOINTS, STAMPS, TWO),
+        'commands': (NUMBERS, LATER, [[3.0, v] for v in V]),
     })
     with pytest.raises(InputError, match='choose a joint with --axis') as told:
         read_record(path)
@@ -105,7 +99,7 @@ def test_one_bad_stamp_is_dropped_and_counted(tmp_path: Path, stamp: int, row: i
     stamps = STAMPS.copy()
     stamps[row] = stamp
     record = read_record(bag(tmp_path / 'bag', {
-        f'/{topics.PLANT_OUTPUT}': (NUMBER, stamps, Y), f'/{topics.CONTROL}': (NUMBER, LATER, V),
+        topics.PLANT_OUTPUT: (NUMBER, stamps, Y), topics.CONTROL: (NUMBER, LATER, V),
     }))
     assert '1 message with a stamp far off left out' in record.timing
     first = int(row == 0)
@@ -119,10 +113,10 @@ def test_one_bad_stamp_is_dropped_and_counted(tmp_path: Path, stamp: int, row: i
 def test_dropped_commands_are_said_and_the_motor_is_not_judged_by_them(tmp_path: Path) -> None:
     motor = np.append(0.0, V[:-1])
     record = read_record(bag(tmp_path / 'bag', {
-        f'/{topics.PLANT_OUTPUT}': (NUMBER, STAMPS, Y),
-        f'/{topics.CONTROL}': (NUMBER, np.delete(LATER, range(5, 150, 10)),
+        topics.PLANT_OUTPUT: (NUMBER, STAMPS, Y),
+        topics.CONTROL: (NUMBER, np.delete(LATER, range(5, 150, 10)),
                                np.delete(V, range(5, 150, 10)).tolist()),
-        f'/{topics.APPLIED_CONTROL}': (NUMBER, STAMPS - 100_000, motor),
+        topics.APPLIED_CONTROL: (NUMBER, STAMPS - 100_000, motor),
     }))
     assert record.notes == ('15 messages of control are missing: the one before is taken for them',)
     assert record.commands is None
@@ -130,6 +124,6 @@ def test_dropped_commands_are_said_and_the_motor_is_not_judged_by_them(tmp_path:
 
 
 def test_nothing_that_may_be_v_or_y_is_told(tmp_path: Path) -> None:
-    path = bag(tmp_path / 'bag', {'/temperature': (NUMBER, STAMPS, Y)})
+    path = bag(tmp_path / 'bag', {'temperature': (NUMBER, STAMPS, Y)})
     with pytest.raises(InputError, match='temperature'):
         read_record(path)

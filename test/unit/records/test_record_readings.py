@@ -39,8 +39,7 @@ def test_rows_that_repeat_a_slower_sensor_are_no_readings(times: int) -> None:
 ], ids=['noise', 'coarse', 'square', 'stepped', 'rest', 'short', 'every second'])
 def test_what_only_looks_repeated_is_kept(y: Array) -> None:
     own, period = own_readings(T[:len(y)], y)
-    assert own.tolist() == np.isfinite(y).tolist()
-    assert period == 0.0
+    assert (own.tolist(), period) == (np.isfinite(y).tolist(), 0.0)
 
 
 @pytest.mark.parametrize('value', [0.0, -1.0, 65535.0])

@@ -99,8 +99,7 @@ def written(path: Path, text: str, encoding: str = 'utf-8') -> Path:
 def test_a_table_is_read_as_it_is(tmp_path: Path, name: str) -> None:
     record = read_record(written(tmp_path / 'a.txt', TABLES[name]))
     assert record.sample_period == pytest.approx(0.02, rel=1e-5)
-    assert record.v.tolist() == V.tolist()
-    assert record.y.tolist() == Y.tolist()
+    assert (record.v.tolist(), record.y.tolist()) == (V.tolist(), Y.tolist())
 
 
 @pytest.mark.parametrize('encoding', ['utf-16', 'utf-16-le', 'utf-8-sig', 'latin-1'])

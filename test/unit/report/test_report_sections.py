@@ -5,8 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from made_bags import MULTI_ARRAY, PARAMETERS, TYPES, rows_of
-from rosbags.rosbag2 import StoragePlugin, Writer
+from made_bags import MULTI_ARRAY, PARAMETERS, rows_of, write_messages
 
 from backlash_ros import topics
 from backlash_ros.core.parameters import Parameters
@@ -37,30 +36,20 @@ class Piece:
 
 
 def write_pieces(path: Path, *pieces: Piece) -> Path:
-    """Write a bag with all of them, in the order of their stamps."""
-    messages: list[tuple[int, int, str, bytes]] = []
+    messages = []
     for piece in pieces:
         truth_first = piece.first if piece.truth_first is None else piece.truth_first
-        for topic, labels, prefix, first in (
-            (topics.SIGNALS, topics.SIGNAL_LABELS, '', piece.first),
-            (topics.ESTIMATES, topics.ESTIMATE_LABELS, '', piece.first),
-            (topics.TRUTH, topics.TRUTH_LABELS, 'true_', truth_first),
+        for topic, labels, prefix, first, begin_s in (
+            (topics.SIGNALS, topics.SIGNAL_LABELS, '', piece.first, piece.begin_s),
+            (topics.ESTIMATES, topics.ESTIMATE_LABELS, '', piece.first, piece.begin_s),
+            (topics.TRUTH, topics.TRUTH_LABELS, 'true_', truth_first,
+             piece.begin_s - piece.truth_early_s),
         ):
-            rows = rows_of(piece.run, labels, frozenset(), prefix, first)
-            begin_s = piece.begin_s - (piece.truth_early_s if topic == topics.TRUTH else 0.0)
+            name = f'{piece.namespace}{topic.replace("controller", piece.node)}'
             messages += [
-                (START_NS + int(begin_s * 1e9) + k * PERIOD_NS, len(messages) + k,
-                 f'/{piece.namespace}{topic.replace("controller", piece.node)}', raw)
-                for k, raw in rows
-            ]
-    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        names = {name for _, _, name, _ in messages}
-        connections = {
-            name: writer.add_connection(name, MULTI_ARRAY, typestore=TYPES) for name in names
-        }
-        for stamp_ns, _, name, raw in sorted(messages):
-            writer.write(connections[name], stamp_ns, raw)
-    return path
+                (START_NS + int(begin_s * 1e9) + k * PERIOD_NS, name, MULTI_ARRAY, raw)
+                for k, raw in rows_of(piece.run, labels, frozenset(), prefix, first)]
+    return write_messages(path, messages)
 
 
 @pytest.fixture(scope='module')

@@ -81,7 +81,6 @@ class Finished:
 
     @contextmanager
     def with_file(self, data: bytes, metadata: bool) -> Iterator[Path]:
-        """A copy of the bag whose file holds this."""
         with tempfile.TemporaryDirectory() as folder:
             bag = Path(folder) / self.bag.name
             shutil.copytree(self.bag, bag)
@@ -198,8 +197,7 @@ def test_what_cannot_be_repaired_is_refused_in_one_line_and_left_as_it_is(
     said = capsys.readouterr()
     assert said.out == ''
     assert words in said.err
-    assert said.err.count('\n') == 1
-    assert contents(tmp_path) == before
+    assert (said.err.count('\n'), contents(tmp_path)) == (1, before)
 
 
 def test_second_repair_keeps_both_originals(tmp_path, finished):

@@ -102,7 +102,6 @@ def test_errors_are_in_percent_of_the_truth_where_it_is_known() -> None:
 
 
 def plan(folder: Path, driver: str, *names: str, **values: object) -> RunPlan:
-    """A plan of axes whose driver is the same text."""
     parameters = effective_parameters(None).replaced({'driver': driver, **values})
     return RunPlan(tuple(
         AxisPlan(name, parameters, folder / name, record=True) for name in names or ('',)
@@ -169,8 +168,7 @@ def test_each_axis_gets_a_driver_in_whose_command_it_is_named(tmp_path: Path) ->
 def test_one_axis_alone_can_be_taken_from_the_file(tmp_path: Path) -> None:
     plan = planned(tmp_path, '--axis', 'tilt', '--lockstep')
     (axis,) = plan.axes
-    assert axis.name == 'tilt'
-    assert [path.name for path in tmp_path.iterdir()] == ['tilt']
+    assert (axis.name, [path.name for path in tmp_path.iterdir()]) == ('tilt', ['tilt'])
     values = [axis.parameters[f'backlash.{name}'] for name in ('m', 'c_r', 'c_l')]
     assert (*values, axis.parameters.frequency) == (0.8, 1.0, -2.0, 9.0)
     processes = [process for stage in plan_processes(plan, None) for process in stage]
@@ -181,7 +179,6 @@ def test_one_axis_alone_can_be_taken_from_the_file(tmp_path: Path) -> None:
 
 
 def begun(folder: Path, driver: str = '', **values: object) -> AxisProgress:
-    """An axis whose run of 100 samples has just begun."""
     p = effective_parameters(None).replaced({'samples': 100, 'driver': driver, **values})
     return AxisProgress(AxisPlan('', p, folder, record=True))
 
