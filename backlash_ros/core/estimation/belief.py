@@ -16,6 +16,7 @@ from backlash_ros.core.estimation.explanations import (
     Setup,
     Window,
     agree,
+    are_precise,
     is_known,
     moves_unexplained,
     noisier,
@@ -57,6 +58,13 @@ class Kept(NamedTuple):
     swapped: frozenset[int] = frozenset()
 
 
+class Look(NamedTuple):
+    """The next time to look for other gaps: at this number of samples, or this deviation of one."""
+
+    at: int = 0
+    gap_std: float = 0.0
+
+
 class Trial(NamedTuple):
     """Samples that a fit must predict before it is published, and has; its noise when adopted."""
 
@@ -85,8 +93,8 @@ class Belief:
     """What is believed after the samples before `end`; inherited: what was known before the run.
 
     found: newest fit that is not adopted. doubt_from: sample from which on the fit is contradicted.
-    next_at: number of samples at which to look again, thorough_at: for other gaps too. coasts:
-    whether the load runs on within the gap. reason: of what is published.
+    next_at: number of samples at which to look again, thorough: for other gaps too. coasts: whether
+    the load runs on within the gap. reason: of what is published.
     """
 
     fit: WindowFit | None = None
@@ -94,7 +102,7 @@ class Belief:
     doubt_from: int | None = None
     end: int = 0
     next_at: int = settings.FIRST_FIT
-    thorough_at: int = 0
+    thorough: Look = field(default_factory=Look)
     kept: Kept = field(default_factory=Kept)
     trial: Trial = field(default_factory=Trial)
     published: Known | None = None
@@ -128,7 +136,7 @@ def published(setup: Setup, belief: Belief) -> Belief:
     assert fit is not None
     if belief.inherited is not None:
         return _beside_inherited(setup, belief, fit, belief.inherited)
-    if not is_known(setup, fit, settings.REVERSALS):
+    if belief.coasts or not is_known(setup, fit, settings.REVERSALS):
         return replace(belief, reason=Status.INCONSISTENT)
     if belief.trial.predicted < belief.trial.must:
         return belief
@@ -163,8 +171,10 @@ def _beside_inherited(setup: Setup, belief: Belief, fit: WindowFit, known: Known
         return replace(belief, reason=Status.INCONSISTENT)
     gain = prior @ np.linalg.pinv(cov + prior)
     joined = Known(known.crossings + gain @ (fit.crossings - known.crossings), prior - gain @ prior)
-    if not as_told and fit.systematic:
+    if belief.coasts or (not as_told and fit.systematic):
         joined = known  # what explains y no better is no reason to move
+    if not are_precise(setup, *joined, fit.systematic):
+        return replace(belief, reason=Status.ACQUIRING)
     unexplained = moves_unexplained(setup, fit)
     return replace(belief, published=joined,
                    reason=Status.INCONSISTENT if unexplained else Status.TRACKING)

@@ -146,7 +146,7 @@ def afresh(
     if best.m < 0.0 or hopeless:
         return best
     best = with_intervals(p, best)
-    best = replace(best, spread=spread(p, best, fits))
+    best = mixed(p, best, fits)
     return with_walk(setup, p, best) if walks else best
 
 
@@ -202,25 +202,38 @@ def with_walk(setup: Setup, p: Problem, f: WindowFit) -> WindowFit:
     return best
 
 
-def spread(p: Problem, best: WindowFit, others: Sequence[WindowFit] = ()) -> Array:
-    """What the covariance of m, c_r, c_l lacks around the best fit (3, 3).
+def mixed(p: Problem, best: WindowFit, others: Sequence[WindowFit] = ()) -> WindowFit:
+    """The likeliest of these fits, with what its covariance of m, c_r, c_l lacks.
 
-    That is the mixture with other fits, and what the readings leave open along the gap, all else
-    fitted: three deviations from the best they should be less likely by 4.5, or it is as far as it
-    takes until they are less likely at all.
+    That is the mixture with the other ones, and with those that the way along the gap leads to.
     """
-    out = np.zeros((3, 3))
-    valid = [f for f in (best, *others) if f.valid]
-    share = np.exp([f.evidence - best.evidence for f in valid])
-    for each, f in zip(share / max(float(share.sum()), 1e-300), valid, strict=True):
+    wider, beyond = _along_the_gap(p, best)
+    fits = [f for f in (best, *others, *beyond) if f.valid]
+    alike_read = [f for f in fits if bool(f.step) == bool(best.step)]
+    likeliest = max(alike_read, key=lambda f: f.evidence, default=best)
+    if likeliest.evidence > best.evidence + 0.5:  # else it is the same, but for rounding
+        return mixed(p, likeliest, fits)
+    share = np.exp([f.evidence - best.evidence for f in fits])
+    for each, f in zip(share / max(float(share.sum()), 1e-300), fits, strict=True):
         apart = f.crossings - best.crossings
-        out += each * np.outer(apart, apart)
+        wider += each * np.outer(apart, apart)
+    return replace(best, spread=wider)
+
+
+def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]:
+    """What readings leave open along the gap, all else fitted (3, 3), and fits that it leads to.
+
+    r deviations from the best they should be less likely by r^2 / 2, or it is as far as it takes
+    until they are less likely at all. Where they are less likely by half of that only, another fit
+    may lie beyond, with other samples at which a side is engaged.
+    """
+    out, beyond = np.zeros((3, 3)), list[WindowFit]()
     if not best.valid or not best.gap > 0.0 or not best.cov[2, 2] > 0.0:
-        return out
+        return out, beyond
     weights, std, v = p.at(best).weights, sqrt(best.cov[2, 2]), float(p.v[0])
     likeliest, widest = p.log_posterior(best, weights), 2.0 * float(np.ptp(p.v))
     for away in (-3.0, 3.0):
-        wider = np.zeros((3, 3))
+        wider, there, behind = np.zeros((3, 3)), best, 0.0
         for reach in away * 3.0 ** np.arange(6.0):
             gap = best.gap + reach * std
             if not 0.0 < gap < widest:
@@ -233,14 +246,18 @@ def spread(p: Problem, best: WindowFit, others: Sequence[WindowFit] = ()) -> Arr
                 for _ in range(FEW_STEPS):
                     there = p.kept(p.step(there, held=True))
             except np.linalg.LinAlgError:  # so far away that y is no number
+                there = best
                 break
-            behind = max(likeliest - p.log_posterior(there, weights), 1.0)
-            apart = there.crossings - best.crossings
-            wider = max(0.5 / behind - reach**-2, 0.0) * np.outer(apart, apart)
-            if behind > 2.0 or there.m <= 0.0:
+            nearer, behind = behind, max(likeliest - p.log_posterior(there, weights), 1.0)
+            if nearer <= 2.0:
+                apart = there.crossings - best.crossings
+                wider = max(0.5 / behind - reach**-2, 0.0) * np.outer(apart, apart)
+            if (behind > 2.0 and nearer) or there.m <= 0.0:
                 break
         out += 0.5 * wider
-    return out
+        if there is not best and there.m > 0.0 and behind < 0.25 * reach**2:
+            beyond.append(p.finished(p.fitted(there)))
+    return out, beyond
 
 
 def of_xi(f: WindowFit) -> Prior | None:
@@ -278,12 +295,22 @@ def forbidden(setup: Setup, f: WindowFit) -> OutOfBounds | None:
 def _is_precise(setup: Setup, f: WindowFit, turns: int) -> bool:
     if not f.valid or turns < _turns_needed(setup) or moves_unexplained(setup, f):
         return False
-    factor = 1.0 / settings.SYSTEMATIC if f.systematic else 1.0
-    std_m, std_c_r, std_c_l = f.crossings_std.tolist()
-    gap_known = max(f.gap_std, std_c_r, std_c_l) < factor * settings.STD_GAP * f.gap
-    chance = settings.BY_CHANCE * f.gap_std
-    no_gap = f.gap < chance and f.gap + chance < settings.NO_GAP * setup.guess
-    return std_m < factor * settings.STD_SLOPE * f.m and (gap_known or no_gap)
+    return are_precise(setup, f.crossings, f.crossings_cov, f.systematic)
+
+
+def are_precise(setup: Setup, crossings: Array, cov: Array, systematic: bool) -> bool:
+    """Whether m, c_r, c_l (3,) of this covariance (3, 3) are known well enough.
+
+    systematic: whether residuals are correlated.
+    """
+    factor = 1.0 / settings.SYSTEMATIC if systematic else 1.0
+    m, c_r, c_l = map(float, crossings)
+    std_m, *std = map(float, np.sqrt(np.maximum(np.diag(cov), 0.0)))
+    gap, gap_std = c_r - c_l, sqrt(max(float(cov[1, 1] + cov[2, 2] - 2.0 * cov[1, 2]), 0.0))
+    gap_known = max(gap_std, *std) < factor * settings.STD_GAP * gap
+    chance = settings.BY_CHANCE * gap_std
+    no_gap = gap < chance and gap + chance < settings.NO_GAP * setup.guess
+    return std_m < factor * settings.STD_SLOPE * m and (gap_known or no_gap)
 
 
 def moves_unexplained(setup: Setup, f: WindowFit) -> bool:

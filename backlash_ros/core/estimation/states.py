@@ -28,6 +28,7 @@ from backlash_ros.core.estimation import settings
 from backlash_ros.core.estimation.belief import (
     Belief,
     Kept,
+    Look,
     State,
     Trial,
     excess,
@@ -40,11 +41,11 @@ from backlash_ros.core.estimation.explanations import (
     afresh,
     alike,
     is_known,
+    mixed,
     noisier,
     of_xi,
     outliers,
     problem_of,
-    spread,
     with_intervals,
     with_walk,
 )
@@ -87,7 +88,7 @@ def _searching(setup: Setup, record: Window, before: Belief) -> Belief:
     count, tried = len(record.v), before.found
     soon = record.end + max(count // settings.BLOCKS, FEWEST)
     known_once = tried is not None and is_known(setup, tried, tried.left.turns)
-    if tried is not None and not known_once and record.end < before.thorough_at \
+    if tried is not None and not known_once and record.end < before.thorough.at \
             and not is_known(setup, tried, record.turns(max(tried.gap, 0.0), tried.p0)):
         return replace(before, end=record.end, next_at=soon)
     # What many reversals do not tell, a few more will not.
@@ -104,12 +105,12 @@ def _searching(setup: Setup, record: Window, before: Belief) -> Belief:
         if newest is not None and is_known(setup, newest, newest.left.turns):
             found, part = newest, shorter
             break
-    after = replace(before, end=record.end, next_at=search_at, thorough_at=search_at,
+    after = replace(before, end=record.end, next_at=search_at, thorough=Look(search_at),
                     found=None, reason=why, coasts=False)
     if found is None:
         return after
     found, swapped = _with_commands(setup, part, found, before.kept.swapped)
-    runs_on = found.m > 0.0 and _leaves_more(setup, found) and coasts(
+    runs_on = _runs_on(
         problem_of(setup, part), found, before.published and before.published.crossings)
     after = replace(
         after, kept=before.kept._replace(swapped=swapped), found=found, coasts=runs_on,
@@ -165,6 +166,11 @@ def _why(setup: Setup, found: WindowFit | None, record: Window, before: Belief) 
     return Status.INCONSISTENT if wrong or contradicts else Status.ACQUIRING
 
 
+def _runs_on(problem: Problem, fit: WindowFit, known: Array | None = None) -> bool:
+    """Whether a load that coasts is what residuals are correlated by."""
+    return fit.m > 0.0 and fit.systematic and coasts(problem, fit, known)
+
+
 def _leaves_more(setup: Setup, found: WindowFit) -> bool:
     """Whether a fit leaves more than noise, and correlated."""
     return found.systematic and noisier(setup, found)
@@ -178,9 +184,10 @@ def _adopted(setup: Setup, record: Window, fit: WindowFit, before: Belief) -> Be
         must = min(must, PREDICTED)  # another noise, or a walk, but not another backlash
     return published(setup, replace(
         before, fit=fit, found=None, doubt_from=None, end=record.end,
+        coasts=_runs_on(before.problem(setup, record), fit),
         kept=before.kept._replace(first=record.first), trial=Trial(must, 0, fit.noise),
         next_at=record.end + max(count // settings.BLOCKS, FEWEST),
-        thorough_at=record.end + count // 4,
+        thorough=Look(record.end + count // 4, 0.5 * fit.gap_std),
     ))
 
 
@@ -221,26 +228,27 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
         before, end=record.end, next_at=record.end + max(count // settings.BLOCKS, FEWEST),
         kept=kept, trial=trial._replace(predicted=trial.predicted + count - new),
     )
-    if record.end >= before.thorough_at:
-        after = replace(after, thorough_at=record.end + 2 * count // 5)
+    narrow = fit.gap_std < before.thorough.gap_std and count <= SHORT_RECORD
+    if narrow or record.end >= before.thorough.at:
         fit = with_intervals(problem, fit)
-        if fit.spread.any():  # else it has been normal for long
-            fit = replace(fit, spread=spread(problem, fit))
-        if count <= SHORT_RECORD and kept.start is None:
+        short = count <= SHORT_RECORD and kept.start is None
+        other = None
+        if short:
             other = afresh(setup, record, None if kept.older is None else fit, kept.older)
-            if other is not None and is_known(setup, other, settings.REVERSALS):
-                best = other if other.evidence > fit.evidence + 3.0 else fit
-                fit = replace(best, spread=spread(problem, best, [fit, other]))
+            if other is not None and not is_known(setup, other, settings.REVERSALS):
+                other = None
+        if short or fit.spread.any():  # else it has been normal for long
+            fit = mixed(problem, fit, () if other is None else (other,))
         fit = with_walk(setup, problem, fit)
+        after = replace(
+            after, thorough=Look(record.end + 2 * count // 5, 0.5 * fit.gap_std))
     else:
         fit = problem.finished(fit)
-    after = replace(after, fit=fit)
+    after = replace(after, fit=fit, coasts=_runs_on(problem, fit))
     cut = excess(setup, record, problem, fit)
     if cut:
         return published(setup, shortened(setup, record, after, cut))
-    after = published(setup, after)
-    wrong = after.reason is Status.INCONSISTENT
-    return replace(after, coasts=wrong and coasts(problem, fit))
+    return published(setup, after)
 
 
 def _contradicts(
