@@ -8,10 +8,8 @@ lockstep and tests give the same numbers whenever they are made.
 
 from __future__ import annotations
 
-import traceback
 from array import array
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,16 +32,10 @@ class ChannelSamples(NamedTuple):
     columns: Array
 
 
-@dataclass(frozen=True)
-class Failure:
-    """What comes of a job that has no result.
-
-    kind: name of the class of the exception that it raised, LOST where its worker died. text: the
-    traceback.
-    """
+class Failure(NamedTuple):
+    """What comes of a job without a result: the class of its exception, LOST of a dead worker."""
 
     kind: str
-    text: str
 
 
 class SampleBuffer:
@@ -133,11 +125,6 @@ class Executor:
 
     restarts = 0
 
-    @property
-    def alive(self) -> bool:
-        """Whether jobs are computed at present."""
-        return True
-
     def open(self, quantities: int = 0, capacity: int = 0) -> Channel:
         """A new channel with a record of the newest `capacity` samples; 0 quantities: no record."""
         return Channel(self, 0, quantities, capacity)
@@ -165,4 +152,4 @@ def computed(job: Job, record: SampleBuffer, since: int, end: int, args: tuple[A
     try:
         return job(record.between(since, end), *args) if record.quantities else job(*args)
     except Exception as error:  # whatever it is: the loop goes on without this result
-        return Failure(type(error).__name__, traceback.format_exc())
+        return Failure(type(error).__name__)

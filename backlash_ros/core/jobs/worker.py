@@ -15,7 +15,6 @@ import signal
 import subprocess
 import sys
 import time
-import traceback
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -59,10 +58,6 @@ class WorkerExecutor(Executor):
         self._starting: Thread | None = None
         self._started: SimpleQueue[subprocess.Popen[bytes]] = SimpleQueue()
         self._worker: _Worker | None = None
-
-    @property
-    def alive(self) -> bool:
-        return self._worker is not None
 
     @property
     def pid(self) -> int | None:
@@ -137,8 +132,7 @@ class WorkerExecutor(Executor):
         self.restarts += 1
         self._deaths += 1
         if dead.sent > bool(dead.unwritten):
-            failure = Failure(LOST, f'the worker (process {dead.process.pid}) died')
-            self._submitted.popleft().result = failure
+            self._submitted.popleft().result = Failure(LOST)
         # At once, but where it died without an answer as the one before it did: longer each time.
         wait_s = min(0.1 * 2.0 ** min(self._deaths - 2, 7), 10.0) if self._deaths > 1 else 0.0
         self._starting = Thread(
@@ -273,7 +267,7 @@ def _result_of(body: bytes, record: SampleBuffer) -> bytes:
             record.drop(since)
         return pickle.dumps(computed(job, record, since, end, args), -1)
     except Exception as error:
-        return pickle.dumps(Failure(type(error).__name__, traceback.format_exc()), -1)
+        return pickle.dumps(Failure(type(error).__name__), -1)
 
 
 def _send(pipe: BinaryIO, content: Any) -> None:
