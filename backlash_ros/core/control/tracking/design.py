@@ -8,6 +8,7 @@ from math import hypot
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import toeplitz
 
 from backlash_ros.core.control.tracking.lq_preview import PreviewGains, preview_gains
 from backlash_ros.core.control.tracking.margin import Feedback, modulus_margin, tolerates
@@ -104,6 +105,25 @@ class TrackingDesign:
         """Of K x for every gain of the schedule, and of |x| at last."""
         gains = np.array(self.schedule)
         return np.append(((gains @ x_cov) * gains).sum(axis=1), x_cov.trace())
+
+    @cached_property
+    def holding(self) -> tuple[tuple[Array, Array], ...]:
+        """For each gain, (L - 1, n) and (L - 1, L): u that it agrees with after it was held.
+
+        Held for j samples from x - x* = e on, u is what u*(k+j) - K (x - x*) asks for then:
+        (1 + sum_i K A^i B) u = u*(k+j) + sum_i K A^(j-1-i) B u*(k+i) - K A^j e,  i = 0 .. j - 1
+        """
+        length = len(self.plans[0].states)
+        rows = powers(self.model.a, np.eye(self.model.order), length)
+        held = []
+        for gain in self.schedule:
+            by_state = np.array(gain) @ rows
+            by_u = toeplitz(np.append(1.0, by_state @ self.model.b)[:length], np.zeros(length))[1:]
+            share = by_u.sum(axis=1)
+            count = int(np.cumprod(share > 0.0).sum())  # beyond, it asks for more the more u is
+            by_both = np.column_stack([-by_state[1:], by_u])[:count] / share[:count, None]
+            held.append((by_both[:, :self.model.order], by_both[:, self.model.order:]))
+        return tuple(held)
 
     @cached_property
     def schedule_sizes(self) -> list[float]:

@@ -20,6 +20,7 @@ from backlash_ros.core.control.tracking.design import SOFTEST, Gain, TrackingDes
 from backlash_ros.core.control.tracking.deviation_noise import DeviationNoise
 from backlash_ros.core.control.tracking.rest import ARRIVED, ASTRAY, TOLERANCE
 from backlash_ros.core.estimate import Estimate, Status
+from backlash_ros.core.plant.backlash import Region
 
 Array = NDArray[np.float64]
 
@@ -92,7 +93,8 @@ class StateFeedback:
         """Use these gains."""
         self._design = design
         self.noise = DeviationNoise(design, self._y_std)
-        self._quiet = 0  # place of the gain in the schedule that its noise asks for
+        # Places in the schedule: of the gain that its noise asks for, and of the one in use.
+        self._quiet = self._in_use = 0
 
     def go_on_from(self, other: StateFeedback, state_known: bool) -> None:
         """Go on where another one is; from the softest, where x_hat begins anew and full of noise.
@@ -195,6 +197,17 @@ class StateFeedback:
             return 0.0, 0.0
         return min(max(feedback, -most), most), min(max(worth, -most), most)
 
+    def furthest(
+        self, deviation: Sequence[float], ahead: Sequence[float], side: Region, turns_in: int,
+    ) -> float:
+        """The furthest u that v can hold and never be asked to come back from until u* turns.
+
+        ahead: u* from this sample on. side: on which v is. turns_in: samples until u* turns.
+        """
+        by_state, by_u = self._design.holding[self._in_use]
+        agreed = side * (by_state @ deviation + by_u @ ahead)[:turns_in]
+        return side * float(agreed.min(initial=inf))
+
     def integrate(self, difference: float, limited: bool) -> None:
         """Take in y* - y; a saturated actuator cannot follow: going on would only wind up."""
         if not self.trust.full:
@@ -245,7 +258,8 @@ class StateFeedback:
         elif state.level > 0 and state.free % stiffen_after == 0:
             state.level -= 1
         unproven = SOFTEST - self.trust.held_for * (SOFTEST + 1) // TRUSTED_AFTER
-        return schedule[max(state.level, unproven, 0 if astray else self._quiet)]
+        self._in_use = max(state.level, unproven, 0 if astray else self._quiet)
+        return schedule[self._in_use]
 
 
 def shrunk_crossings(estimate: Estimate, deviations: float, known: bool) -> tuple[float, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -166,7 +166,7 @@ class Tracking(ControlStructure):
         noise = 4.0 * feedback.noise_u + plan.noise_band
         u_d = plan.aim - correction
         if feedback.knows_noise:
-            u_d = self._without_crossing(u_d, plan.aim - worth, noise, inverse)
+            u_d = self._without_crossing(u_d, plan.aim - worth, noise, deviation, inverse)
         added = self.hand_over.fade()
         u_d += added
         pull, before = rest.pull_back(deviation, feedback.most), rest.state.mode
@@ -231,12 +231,14 @@ class Tracking(ControlStructure):
         return trajectory.take(y_m)
 
     def _without_crossing(
-        self, wanted: float, worth: float, noise: float, inverse: BacklashInverse,
+        self, wanted: float, worth: float, noise: float, deviation: Sequence[float],
+        inverse: BacklashInverse,
     ) -> float:
         """Return u_d: the u that is wanted where that costs no crossing, else what is worth one.
 
         What is behind the u that is held makes v cross the gap; what is beyond the furthest u* has
-        to come back across it, and has to be more than noise.
+        to come back across it, and has to be more than noise. What is not must not go beyond the
+        trajectory by so much that feedback will want it back either.
         """
         plan, side, (c_r, c_l) = self.trajectory.state, inverse.side, self.feedback.trust.crossings
         if side is Region.GAP or side is not plan.side or c_r == c_l:
@@ -245,6 +247,9 @@ class Tracking(ControlStructure):
         least, most = min(worth * side, held), max(plan.furthest * side, held)
         if worth * side > most + noise:
             most = worth * side
+        elif wanted * side > max(plan.aim * side, held):
+            furthest = self.feedback.furthest(deviation, plan.ahead, side, plan.turns_in)
+            most = max(min(most, furthest * side), plan.aim * side, held)
         return min(max(wanted * side, least), most) * side
 
     def _side(self, turned: bool, u_d: float, noise: float, inverse: BacklashInverse) -> Region:

@@ -30,9 +30,10 @@ class TrajectoryState:
     """Where the trajectory is, and where it goes.
 
     x: x*, shape (n,). q: q*. side: on which u* moves, GAP until it does. extreme: the furthest u*
-    in that direction, nan before there is one. decided: samples for which the side stays. furthest:
-    u* to which u is to go without turning. ahead: u* from this sample on, as far as the references
-    are known. moved: by how much x* did last.
+    in that direction, nan before there is one. decided: samples for which the side stays. turns_in:
+    samples until u* turns, or all that are known ahead. furthest: u* to which u is to go without
+    turning. ahead: u* from this sample on, as far as the references are known. moved: by how much
+    x* did last.
     noise_band: how far the noise of the references may turn u*. noise: of u*, what is no turn.
     """
 
@@ -41,6 +42,7 @@ class TrajectoryState:
     side: Region = Region.GAP
     extreme: float = nan
     decided: int = 0
+    turns_in: int = 0
     furthest: float = nan
     ahead: list[float] = field(default_factory=lambda: [0.0])
     moved: float = 0.0
@@ -144,7 +146,7 @@ class IdealTrajectory:
         state, ahead = self.state, self.state.ahead
         if isnan(state.extreme):
             state.extreme = ahead[0]
-        before, taken, turns = state.side, ceil(crossing), True
+        before, taken, turns_in = state.side, ceil(crossing), 0
         arrival = max(taken - 1, 0)
         # What moves y by less than its noise is no turn, unless it is a hundredth of the gap.
         least = min(noise_std / self._design.push_ahead, 0.01 * gap_u)
@@ -158,14 +160,16 @@ class IdealTrajectory:
                 state.side = Region((first > 0.0) - (first < 0.0))
         else:
             peak = _turn(ahead, state, band, taken)
-            turns = peak is not None
+            turns_in = len(ahead) if peak is None else max(peak, 0)
             later = ahead[min(arrival, len(ahead) - 1)]
             if peak is not None and peak < taken and (later - state.extreme) * state.side <= 0.0:
                 state.side = Region(-state.side)
                 state.extreme, state.decided = later, arrival
         if (ahead[0] - state.extreme) * state.side > 0.0 and not state.decided:
             state.extreme = ahead[0]
+        state.turns_in = turns_in if state.side is before else 0
         # What is no turn is not followed there and back, but to where it ends.
+        turns = state.turns_in < len(ahead)
         state.furthest = max(ahead, key=lambda u: u * state.side) if turns else ahead[-1]
         return state.side is not before
 
