@@ -55,6 +55,19 @@ def test_noise_of_the_reference_does_not_make_v_cross_the_gap(noise: float, band
     assert error < 0.5 * noise + 1e-6
 
 
+def test_what_is_left_of_u_beside_an_integrator_does_not_make_v_cross_the_gap() -> None:
+    b, a, _ = signal.cont2discrete(([20.0], [1.0, 20.0, 0.0]), PERIOD)
+    integrator = {'plant__numerator': b[0, 1:].tolist(), 'plant__denominator': a.tolist(),
+                  'control__min': -np.inf, 'control__max': np.inf, 'control__rate_max': np.inf,
+                  'inverse__take_up_rate': np.inf, 'output_quantum': 0.0}
+    asked = 0.1 * signal.sawtooth(3.0 * np.arange(0.0, 10.0, PERIOD) + 0.5 * np.pi, 0.5)
+    v, _ = moved(asked, **integrator)
+    gapless = {f'{of}__{side}': sign * 1e-9 for of in ('backlash', 'estimator__initial')
+               for side, sign in (('c_r', 1.0), ('c_l', -1.0))}
+    ideal, _ = moved(asked, **integrator, **gapless)
+    assert turns(v, 0.5 * GAP) <= turns(ideal, 0.01 * GAP) + 2
+
+
 @pytest.mark.parametrize('noise', [1.1e-3, 0.1 * GAP * KNOWN['m']])
 @pytest.mark.parametrize('rests_from', [12.0, 9.0])
 def test_noise_of_y_larger_than_configured_does_not_make_v_cross_the_gap(noise, rests_from):
@@ -97,8 +110,8 @@ def test_feedback_is_as_hard_as_its_noise_beside_the_gap_allows(noise: float) ->
         Parameters({'waveform': 'file', 'amplitude': 1.0}), tuple(asked.tolist()))
     run, structure = loop.run(len(asked)), loop.controller.structure
     assert isinstance(structure, Tracking)
-    assert 0.0 < structure.feedback.noise <= 0.1 * 1.3 * 6.0
-    hardest = structure.feedback.noise == structure.feedback._noise_of(0)
+    assert 0.0 < structure.feedback.noise_u <= 0.1 * 1.3 * 6.0
+    hardest = structure.feedback.noise_u == structure.feedback.noise.u_std[0]
     assert hardest is (noise == 0.0)
     assert noise == 0.0 or turns(run.column('v'), 3.0) < 80
 
@@ -146,3 +159,25 @@ def test_a_deviation_that_noise_explains_is_left_alone() -> None:
     full = SLOW.feedback.gain[0]
     beyond = feedback.u([1e-2, 0.0], held_back=False, largest=1.0)[0]
     assert beyond == pytest.approx(full * (1e-2 - 3.5e-3))
+
+
+def test_a_deviation_that_noise_of_the_references_explains_is_worth_no_crossing() -> None:
+    feedback = StateFeedback(SLOW, 1.0, 1e-3)
+    feedback.trust = Trust(held_for=TRUSTED_AFTER)
+    feedback.prepare(np.zeros((2, 2)), 1e-3, np.eye(2), 1e-2)
+    wanted, worth = feedback.u([1e-2, 0.0], held_back=False, largest=1.0)
+    assert wanted > 0.0
+    assert worth == 0.0
+
+
+def test_u_goes_no_further_than_feedback_agrees_with_as_long_as_it_is_held() -> None:
+    feedback = StateFeedback(SLOW, 1.0, 0.0)
+    assert feedback.furthest([0.0, 0.0], [1.0] * 4, Region.RIGHT, 4) == pytest.approx(1.0)
+    furthest, model, gain = feedback.furthest([-0.1, 0.0], [1.0] * 4, Region.RIGHT, 4), \
+        SLOW.model, np.array(SLOW.schedule[0])
+    x, asked = np.array([-0.1, 0.0]), []
+    for _ in range(4):
+        asked.append(1.0 - gain @ x)
+        x = model.a @ x + model.b * (furthest - 1.0)
+    assert min(asked[1:]) == pytest.approx(furthest)
+    assert asked[0] > furthest > 1.0
