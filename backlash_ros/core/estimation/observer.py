@@ -12,7 +12,7 @@ Automatic Control 15 (1970) 175-184).
 from __future__ import annotations
 
 from collections import deque
-from functools import lru_cache
+from functools import lru_cache, partial
 from math import isnan, nan, sqrt
 from operator import mul
 from typing import NamedTuple
@@ -85,7 +85,9 @@ def _gains_of(numerator: tuple[float, ...], denominator: tuple[float, ...]) -> t
 class Observer:
     """Follows the state of G. noise_std: of y. gains: where they are known already.
 
-    before: that of another G for the same plant: innovations are no larger with this one.
+    before: that of another G for the same plant: innovations are no larger with this one. variance:
+    of the innovation, measured. cov: of the state while innovations are what they are, (n, n): the
+    same array until then.
     """
 
     def __init__(
@@ -95,40 +97,35 @@ class Observer:
         self._model, self._gains, self._level = model, gains, -1
         highest = len(RATIOS) if before is None else before._level
         self._use(min(len(RATIOS) // 2, highest), noise_std)
-        self.variance = (self._gain.innovation * noise_std) ** 2  # of the innovation, measured
-        self._advance = model.transfer_function.advance
+        self.variance = (self._gain.innovation * noise_std) ** 2
+        # In the observer form; maps it to the coordinates of StateModel.
         self._x = [0.0] * model.order
         self._to_state = tuple(map(tuple, model.to_state.tolist()))
+        # Take u over one period and return the y that is expected after it.
+        self.predict = partial(model.transfer_function.advance, self._x)
 
     def _use(self, level: int, noise_std: float) -> None:
         """Use the gain for this noise on u, and on y."""
         if level != self._level:
             # All gains take milliseconds: where no fit brought them, only the one that is needed.
-            self._gain = gain_of(self._model, RATIOS[level]) if self._gains is None \
-                else self._gains[level]
+            self._gain = self._gains[level] if self._gains else gain_of(self._model, RATIOS[level])
         self._level, self.noise_std = level, noise_std
-        # Of the state while the innovations are what they are, (n, n): the same array until then.
         self.cov = self._gain.cov * noise_std**2
 
     @property
     def state(self) -> list[float]:
         """x in the coordinates of StateModel, n values."""
-        x = self._x
-        return [sum(map(mul, row, x)) for row in self._to_state]
+        return [sum(map(mul, row, self._x)) for row in self._to_state]
 
     def place(self, x: Array, known: bool) -> None:
         """Go on from the state x in the observer form.
 
-        known: whether a fit knows it better than the newest samples do, so that they are to move
-        it little.
+        known: whether a fit knows it better than the newest samples do, which are to move it little
+        then.
         """
-        self._x = x.tolist()
+        self._x[:] = x.tolist()
         if known:
             self._use(0, self.noise_std)
-
-    def predict(self, u: float) -> float:
-        """Take u over one period and return the y that is expected after it."""
-        return self._advance(self._x, u)
 
     def correct(self, innovation: float) -> None:
         """Take in y minus what was expected."""
@@ -216,9 +213,8 @@ class Following:
         """State of G in the coordinates of `model`, n values."""
         if self.observer is not None:
             return self.observer.state
-        state: list[float] = [0.0] * self.model.order if self.before is None \
-            else self.before.x_hat.tolist()
-        return state
+        none: list[float] = [0.0] * self.model.order
+        return none if self.before is None else self.before.x_hat.tolist()
 
     def change_model(self, model: StateModel, gains: tuple[Gain, ...] | None) -> None:
         """Give the state of this G from now on; gains: of its observer."""
@@ -234,28 +230,30 @@ class Following:
 
     def step(self, y: float | None, interval: Interval, estimate: Estimate) -> None:
         """Take in y(k), None if it was lost, and v of the interval before it."""
-        observer, v = self.observer, interval.v
-        p = v if observer is None else clamp(self._p, v, v + estimate.c_r - estimate.c_l)
-        self.since_motion = self.since_motion + 1 if p == self._p else 0
-        self._p = p
+        observer, v, p = self.observer, interval.v, self._p
         if observer is None:
+            self._p = v
             if self.before is not None:
                 self.before.update(y, interval)
-            return
+        else:
+            self._advance(v, nan if y is None else y, estimate)
+            expected, self.innovation = observer.predict(self.u), nan
+            if y is not None:
+                self.innovation = innovation = y - expected
+                inside = innovation * innovation <= GATE**2 * observer.variance
+                self.beyond = 0 if inside else self.beyond + 1
+                if inside or self.beyond >= OUTLIERS:  # so many in a row are none
+                    observer.correct(innovation)
+                else:
+                    self.outliers += 1
+        self.since_motion = self.since_motion + 1 if self._p == p else 0
+
+    def _advance(self, v: float, y: float, estimate: Estimate) -> None:
+        """Take the play over v, and keep u and y, nan where it was lost."""
+        self._p = p = clamp(self._p, v, v + estimate.c_r - estimate.c_l)
         self.u = u = estimate.m * (p - estimate.c_r)
         self._u.append(u)
-        self._y.append(nan if y is None else y)
-        expected = observer.predict(u)
-        if y is None:
-            self.innovation = nan
-            return
-        self.innovation = innovation = y - expected
-        inside = innovation * innovation <= GATE**2 * observer.variance
-        self.beyond = 0 if inside else self.beyond + 1
-        if inside or self.beyond >= OUTLIERS:  # so many in a row are none
-            observer.correct(innovation)
-        else:
-            self.outliers += 1
+        self._y.append(y)
 
     def go_on_from(
         self, place: Place, newer: Array, estimate: Estimate, noise_std: float, known: bool,
@@ -265,24 +263,20 @@ class Following:
         newer: v and y of the samples since then (2, M). known: whether the fit explains all of its
         samples, so that it knows the state better than the newest of them do.
         """
-        own = self.model.transfer_function
-        follows = own is place.model or (
-            np.array_equal(place.model.denominator, own.denominator)
-            and np.array_equal(place.model.numerator, own.numerator))
+        own, other = self.model.transfer_function, place.model
+        follows = own is other or (np.array_equal(other.denominator, own.denominator)
+                                   and np.array_equal(other.numerator, own.numerator))
         if self.observer is None:
             self.observer = Observer(self.model, noise_std, None, place.gains if follows else None)
         else:
             self.observer.settle(noise_std)
-        observer, gap = self.observer, estimate.c_r - estimate.c_l
+        observer = self.observer
         self._u, self._y = deque(place.u.tolist(), ROWS), deque(place.y.tolist(), ROWS)
         self._p, self.u = place.p, estimate.m * (place.p - estimate.c_r)
         if follows:
             observer.place(place.x, known)
         for v, y in newer.T.tolist():
-            self._p = clamp(self._p, v, v + gap)
-            self.u = estimate.m * (self._p - estimate.c_r)
-            self._u.append(self.u)
-            self._y.append(y)
+            self._advance(v, y, estimate)
             if follows:
                 innovation = y - observer.predict(self.u)
                 if innovation * innovation <= GATE**2 * observer.variance:  # not where y was lost

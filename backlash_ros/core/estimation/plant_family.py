@@ -38,12 +38,10 @@ class Family(Protocol):
     """
 
     @property
-    def count(self) -> int:
-        """K."""
+    def count(self) -> int: ...
 
     @property
-    def leaks(self) -> int:
-        """See above."""
+    def leaks(self) -> int: ...
 
     def at(self, xi: list[float]) -> tuple[list[float], list[float]]:
         """b and a of y(k) = sum b_i u(k-i) - sum a_i y(k-i), of one length.
@@ -59,30 +57,28 @@ class Family(Protocol):
 class PlantFamily:
     """G(z; xi) around a nominal G.
 
-    model: the nominal G. uncertainty: relative prior deviation r of its frequencies, damping ratios
-    and delay; 0 where G is exact. integrates: whether it has a pole at 1. memory: samples after
-    which the slowest stable mode has died out, within reason.
+    model: the nominal G. uncertainty: relative prior deviation of its frequencies, damping ratios
+    and delay; 0 where G is exact, K = 0. integrates: whether it has a pole at 1. memory: samples
+    after which the slowest stable mode has died out, within reason.
     """
 
     def __init__(self, model: TransferFunction, uncertainty: float) -> None:
         widest = 0.125  # width of what acts half a sample late
         of_leak = 5e-3  # prior deviation of the leak, per sample and unit of uncertainty
-        b = np.trim_zeros(model.numerator, 'f')
-        self.model = model
-        self._delay = len(model.denominator) - len(b)
-        poles = model.poles
+        b, poles = np.trim_zeros(model.numerator, 'f'), model.poles
         integrators = abs(poles - 1.0) < ON_CIRCLE
-        moving = (abs(poles) > ON_CIRCLE) & (abs(poles) < 1.0 - ON_CIRCLE)
-        moving &= ~((poles.imag == 0.0) & (poles.real < 0.0))
-        fixed = ~integrators & ~moving & (abs(poles) > ON_CIRCLE)
-        self.integrates = bool(integrators.any())
+        elsewhere = ~integrators & (abs(poles) > ON_CIRCLE)
+        moving = elsewhere & (abs(poles) < 1.0 - ON_CIRCLE)
+        moving &= (poles.imag != 0.0) | (poles.real >= 0.0)
+        self.model, self.integrates = model, bool(integrators.any())
+        self.memory = memory_of(max(abs(poles[moving]), default=0.0))
         # Denominator of the poles that do not move, but for the first integrator.
-        rest = [*poles[fixed], *[1.0] * (int(integrators.sum()) - 1)]
+        rest = np.concatenate([poles[elsewhere & ~moving], poles[integrators][1:].round()])
         self._rest: list[float] = np.atleast_1d(np.real(np.poly(rest))).tolist()
         self._pairs, self._nominal = _sections(poles[moving])
-        a = self._stable(self._nominal)
-        self._gain = sum(a)
-        late = max(self._delay + _mean(b.tolist()) - _mean(a), 1.0)
+        a = [x.real for x in self._stable(self._nominal)]
+        self._gain, self._delay = sum(a), len(model.denominator) - len(b)
+        late = max(self._delay + _mean(b) - _mean(np.array(a)), 1.0)
         # Prior deviation and limit of what each xi moves: a leak of 0.1 a sample, a lag of 40
         # samples, a factor of 20 on Omega and D.
         self._scales: list[tuple[float, float]] = []
@@ -91,25 +87,14 @@ class PlantFamily:
                 *[(of_leak * uncertainty, 0.1)] * self.integrates, (uncertainty * late, 40.0),
                 (widest, inf), *[(uncertainty, 3.0)] * len(self._nominal),
             ]
-        shorter = np.atleast_1d(np.poly([-1.0] * max(len(b) - 2, 0)))
-        wide = np.convolve(shorter * b.sum() / shorter.sum(), [1.0, -2.0, 1.0])
-        taps, later, wide = (
-            np.pad(taps, (0, max(len(b) + 1, 3) - len(taps)))
-            for taps in (b, np.append(0.0, b), wide)
-        )
+        # A leak says nothing of how wrong the rest of G is.
+        self.count, self.leaks = len(self._scales), int(self.integrates and uncertainty > 0.0)
+        shorter = np.poly1d([1.0, 1.0]) ** max(len(b) - 2, 0)
+        wide = np.convolve(shorter * (b.sum() / shorter(1.0)), [1.0, -2.0, 1.0])
         # B, and what it changes by with lag and width.
-        self._taps: list[list[float]] = [taps.tolist(), (later - taps).tolist(), wide.tolist()]
-        self.memory = memory_of(max((abs(pole) for pole in poles[moving]), default=0.0))
-
-    @property
-    def count(self) -> int:
-        """K, 0 where G is exact."""
-        return len(self._scales)
-
-    @property
-    def leaks(self) -> int:
-        """How many xi are leaks, whose size says nothing of how wrong the rest of G is."""
-        return int(self.integrates and bool(self._scales))
+        self._taps: list[list[float]] = [
+            padded(taps, max(len(b) + 1, 3)).tolist()
+            for taps in (b, np.append(0.0, b) - np.append(b, 0.0), wide)]
 
     def at(self, xi: list[float]) -> tuple[list[float], list[float]]:
         b, a = self._coefficients(xi)
@@ -160,11 +145,9 @@ class PlantFamily:
 
     def model_at(self, xi: list[float]) -> TransferFunction:
         """G(z; xi) as a transfer function."""
-        b, a = self.at(xi)
-        numerator, denominator = (np.trim_zeros(np.array(x), 'b') for x in ([0.0, *b], a))
-        length = max(len(numerator), len(denominator))
-        return TransferFunction(*(
-            np.pad(x, (0, length - len(x))).tolist() for x in (numerator, denominator)))
+        b, a = (np.trim_zeros(np.array(x), 'b') for x in ([0.0, *self.at(xi)[0]], self.at(xi)[1]))
+        length = max(len(b), len(a))
+        return TransferFunction(padded(b, length).tolist(), padded(a, length).tolist())
 
     def response_slopes(self, xi: list[float], z: NDArray[np.complex128]) -> NDArray[np.complex128]:
         """Derivatives of ln G(z; xi) by each xi at the points z (M,), shape (M, K)."""
@@ -224,7 +207,7 @@ def _product(*factors: Sequence[complex]) -> list[complex]:
     return product
 
 
-def _mean(taps: Sequence[complex]) -> float:
+def _mean(taps: Array) -> float:
     """Delay of slow motion in taps [samples]."""
-    gain = sum(taps).real
-    return sum(i * tap.real for i, tap in enumerate(taps)) / gain if gain else 0.0
+    gain = float(taps.sum())
+    return float(np.arange(len(taps)) @ taps) / gain if gain else 0.0

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.plant_family import Family, state_columns
+from backlash_ros.core.estimation.plant_family import Family, sensitivities, state_columns
 from backlash_ros.core.estimation.settings import ROWS
 from backlash_ros.core.plant.backlash import play
 from backlash_ros.core.plant.numerics import lfilter
@@ -44,10 +44,9 @@ def search(
     swing = float(np.ptp(v))
     top = min(swing, widest)
     gaps: Array = np.append(none * swing, np.geomspace(smallest * min(swing, top), top, 32))
-    starts: Array = np.arange(5) / 4.0  # within each gap
-    found = [h for h in compared.evidence(gaps, starts) if isfinite(h.evidence)]
-    if not found:
-        return [], compared.null
+    # Of so many at once that memory holds them.
+    parts = np.array_split(gaps, 1 + len(gaps) * len(v) * (1 + family.count) // 500_000)
+    found = [h for part in parts for h in compared.evidence(part) if isfinite(h.evidence)]
     e = [-inf, *(h.evidence for h in found), -inf]
     peaks = [h for k, h in enumerate(found) if e[k] < e[k + 1] > e[k + 2]]
     first = sorted(peaks, reverse=True)[:3]
@@ -62,21 +61,20 @@ class _Comparison:
     ) -> None:
         self._family, self._v, self._xi, self._nominal = family, v, xi, noise_std
         self._known = np.isfinite(y)
-        self._begins, self._weights = _bins(v, self._known)
+        self._begins = _bins(v)
+        readings = np.add.reduceat(self._known.astype(np.float64), self._begins)
+        self._weights = (readings > 0.0) / np.sqrt(np.maximum(readings, 1.0))
         b, a = family.at(xi)
-        common = np.column_stack([state_columns(a, len(v)), lfilter(b, a, np.ones(len(v)))])
-        self._q = np.linalg.qr(self._averaged(common.T).T)[0]
+        common = np.vstack([state_columns(a, len(v)).T, lfilter(b, a, np.ones(len(v)))])
+        self._q = np.linalg.qr(self._averaged(common).T)[0]
         self._y = self._without_common(self._averaged(np.where(self._known, y, 0.0)))
+        self._freedom = max(self._q.shape[0] - self._q.shape[1], 1)
         self.null = float(self._value(self._y @ self._y))
-
-    @property
-    def _freedom(self) -> int:
-        return max(self._q.shape[0] - self._q.shape[1], 1)
 
     def _value(self, squares: Array) -> Array:
         """Evidence of what leaves these squares, noise integrated out."""
-        rows = self._q.shape[0]
-        return np.asarray(-0.5 * self._freedom * np.log((squares + self._nominal**2) / rows))
+        noise = (squares + self._nominal**2) / len(self._q)
+        return np.asarray(-0.5 * self._freedom * np.log(noise))
 
     def _averaged(self, columns: Array) -> Array:
         """Columns (..., N) summed over bins and divided by the root of the readings in each."""
@@ -87,59 +85,40 @@ class _Comparison:
         """Columns (..., R) without what state and o explain."""
         return np.asarray(columns - (columns @ self._q) @ self._q.T)
 
-    def evidence(self, gaps: Array, shares: Array) -> list[Hypothesis]:
-        """The best beginning of each gap; shares: places of it within the gap."""
-        each = max(2_000_000 // (len(shares) * len(self._v)), 1)  # numbers that are held at once
-        if len(gaps) > each:
-            return self.evidence(gaps[:each], shares) + self.evidence(gaps[each:], shares)
-        b, a = self._family.at(self._xi)
+    def evidence(self, gaps: Array) -> list[Hypothesis]:
+        """The best beginning of each gap."""
+        shares: Array = np.arange(5) / 4.0  # places of the beginnings within the gap
+        (b, a), k = self._family.at(self._xi), self._family.count
         g = np.repeat(gaps, len(shares))
         begins = self._v[0] + np.tile(shares, len(gaps)) * g
         p = play(self._v, g, begins)
         begun = np.logical_and.accumulate(p == p[:, :1], axis=1).astype(np.float64)
-        columns = [self._averaged(lfilter(b, [1.0], lfilter([1.0], a, np.stack([p, begun], 1))))]
-        if self._family.count:
-            # xi changes no constant part of u: that keeps to o.
-            move = lfilter([1.0], a, p - p[:, :1])
-            y_over_a = lfilter([1.0], a, lfilter(b, [1.0], move))
-            for db, da in zip(*self._family.slopes(self._xi), strict=True):
-                column = lfilter(db, [1.0], move) - lfilter(da, [1.0], y_over_a)
-                columns.append(self._averaged(column)[:, None])
-        stack = self._without_common(np.concatenate(columns, axis=1))
+        # xi changes no constant part of u: that keeps to o.
+        move = lfilter([1.0], a, p - p[:, :1])
+        y_over_a = lfilter([1.0], a, lfilter(b, [1.0], move))
+        columns = self._without_common(np.concatenate([
+            self._averaged(lfilter(b, [1.0], lfilter([1.0], a, np.stack([p, begun], 1)))),
+            self._averaged(sensitivities(self._family, self._xi, move, y_over_a)),
+        ], axis=1))
         y = np.broadcast_to(self._y, (len(g), 1, len(self._y)))
-        r = _triangles(np.concatenate([stack, y], axis=1).transpose(0, 2, 1))
-        noise = np.sqrt((r[:, -1, -1] ** 2 + self._nominal**2) / self._freedom)
-        m = np.abs(r[:, 0, -1] / r[:, 0, 0]) + 1e-30
-        # p0 is anywhere within the gap.
-        of_begin = noise * 12.0**0.5 / (m * g)
-        r = _triangles(np.concatenate([r, of_begin[:, None, None] * np.eye(1, r.shape[2], 1)], 1))
-        off = r[:, 1, -1] / r[:, 1, 1]
-        slope = (r[:, 0, -1] - r[:, 0, 1] * off) / r[:, 0, 0]
-        p0 = np.clip(begins + off / slope, self._v[0], self._v[0] + g)
-        volume = np.log(of_begin / np.abs(r[:, 1, 1]))
-        best = (self._weighed(r, noise / (np.abs(slope) + 1e-30)) + volume).reshape(len(gaps), -1)
-        at = best.argmax(axis=1) + np.arange(len(gaps)) * len(shares)
-        return [
-            Hypothesis(float(best.ravel()[i]), float(g[i]), float(p0[i]), float(slope[i]))
-            for i in at
-        ]
-
-    def _weighed(self, r: Array, noise: Array) -> Array:
-        """Evidence (H,) from triangles (H, K + 3, K + 3), at the best scale of the error of G.
-
-        noise: over m (H,).
-        """
-        k = self._family.count
-        if not k:
-            return self._value(r[:, -1, -1] ** 2)
-        values = []
-        for scale in (0.03, 0.3, 1.0):  # of the error of G that are weighed
-            prior = (noise / scale)[:, None, None] * np.eye(k, k + 3, 2)
-            s = _triangles(np.concatenate([r, prior], axis=1))
-            volume = np.log(np.abs(np.diagonal(s, 0, 1, 2)[:, 2:-1]) + 1e-300).sum(axis=1)
-            values.append(self._value(s[:, -1, -1] ** 2) + k * np.log(noise / scale)
-                          - 0.5 * scale**2 - volume)
-        return np.asarray(np.max(values, axis=0))
+        r = _triangles(np.concatenate([columns, y], axis=1).transpose(0, 2, 1))
+        # In units of v.
+        noise = np.sqrt((r[:, -1, -1] ** 2 + self._nominal**2) / self._freedom) \
+            / (np.abs(r[:, 0, -1] / r[:, 0, 0]) + 1e-30)
+        evidence = np.full(len(g), -inf)
+        for scale in (0.03, 0.3, 1.0) if k else (1.0,):  # of the error of G that are weighed
+            # p0 is anywhere within the gap.
+            prior = np.column_stack([noise * 12.0**0.5 / g, *[noise / scale] * k])
+            of_prior = prior[:, :, None] * np.eye(1 + k, 3 + k, 1)
+            s = _triangles(np.concatenate([r, of_prior], axis=1))
+            volume = np.log(prior / (np.abs(np.diagonal(s, 0, 1, 2)[:, 1:-1]) + 1e-300)).sum(axis=1)
+            value = self._value(s[:, -1, -1] ** 2) + volume - 0.5 * scale**2
+            evidence = np.maximum(evidence, value)
+        off = s[:, 1, -1] / s[:, 1, 1]
+        m = (s[:, 0, -1] - s[:, 0, 1] * off) / s[:, 0, 0]
+        p0 = np.clip(begins + off / m, self._v[0], self._v[0] + g)
+        best = evidence.reshape(len(gaps), -1).argmax(axis=1) + np.arange(0, len(g), len(shares))
+        return [Hypothesis(*one) for one in np.column_stack([evidence, g, p0, m])[best].tolist()]
 
 
 def _triangles(stacks: Array) -> Array:
@@ -147,16 +126,14 @@ def _triangles(stacks: Array) -> Array:
     return np.asarray(np.linalg.qr(stacks, mode='r'))
 
 
-def _bins(v: Array, known: NDArray[np.bool_]) -> tuple[NDArray[np.intp], Array]:
-    """Where some 1,500 bins begin, and 1 / sqrt(readings) of each; every sample for short records.
+def _bins(v: Array) -> NDArray[np.intp]:
+    """Where some 1,500 bins begin; every sample for short records.
 
     Half of the bins are spread evenly over the time and half over the motion of v.
     """
     count = len(v)
-    begins: NDArray[np.intp] = np.arange(count)
-    if count > ROWS:
-        move = np.abs(np.diff(v, prepend=v[0]))
-        clock = np.cumsum(0.5 / count + 0.5 * move / max(float(move.sum()), 1e-300))
-        begins = np.flatnonzero(np.diff(np.floor(clock * ROWS), prepend=-1.0) > 0)
-    readings = np.add.reduceat(known.astype(np.float64), begins)
-    return begins, np.where(readings > 0.0, 1.0 / np.sqrt(np.maximum(readings, 1.0)), 0.0)
+    if count <= ROWS:
+        return np.arange(count)
+    move = np.abs(np.diff(v, prepend=v[0]))
+    clock = np.cumsum(0.5 / count + 0.5 * move / max(float(move.sum()), 1e-300))
+    return np.flatnonzero(np.diff(np.floor(clock * ROWS), prepend=-1.0) > 0)
