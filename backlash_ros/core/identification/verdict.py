@@ -143,7 +143,7 @@ def _doubts(f: Findings) -> Iterator[Doubt]:
 def _coasts(f: Findings) -> Iterator[Doubt]:
     """Where a load that runs on within the gap explains y better, with another gap."""
     o = f.observed
-    if o.rms > 1.5 * o.noise and o.family is not None:
+    if o.rms > 1.1 * o.noise and o.family is not None:
         gap = abs(o.coasting.at[0]) * o.family.swing
         share = min(o.family.share(o.coasting, o.one_play, o.noise), 1.0)
         yield Doubt(share * abs(gap - f.gap), 'the load coasts while v crosses the gap, which '

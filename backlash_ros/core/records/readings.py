@@ -21,9 +21,11 @@ def quantum(y: Array) -> float:
     if len(values) < 2 or len(values) > 0.8 * len(y):
         return 0.0
     steps = np.diff(values)
-    step = float(steps[steps > 1e-9 * (values[-1] - values[0])].min())
-    whole = (values - values[0]) / step
-    return step if np.abs(whole - np.round(whole)).max() < 0.05 else 0.0
+    steps[steps <= 1e-9 * (values[-1] - values[0])] = 0.0
+    # From value to value, as the digits of a file may end before those of the step.
+    numbers = np.append(0.0, np.cumsum(np.round(steps / steps[steps > 0.0].min())))
+    step = float((values[-1] - values[0]) / numbers[-1])
+    return step if np.abs((values - values[0]) / step - numbers).max() < 0.05 else 0.0
 
 
 def own_readings(t: Array, y: Array) -> tuple[Flags, float]:
