@@ -124,7 +124,6 @@ class ControllerNode(ManagedNode):
             self.start()
 
     def _announce(self) -> None:
-        """Say in the log what the node is about."""
         p, to, name = self.settings, self._io.topics, self.resolve_topic_name
         period = p.sample_period
         joints = f'joints {", ".join(p.joint_names)}: ' if p.joint_names[0] else ''
@@ -316,7 +315,6 @@ class ControllerNode(ManagedNode):
                 self._follow_up(loops, steps)
 
     def _follow_up(self, loops: JointLoops, steps: Mapping[str, ControlStep]) -> None:
-        """Tell of the steps of a sample."""
         self._steps.publish(loops.by_name, steps)
         self._news += [
             joint for joint in self.joints
@@ -328,7 +326,6 @@ class ControllerNode(ManagedNode):
     # --- what happens besides --------------------------------------------------------------------
 
     def _check_change(self, p: Parameters) -> None:
-        """Raise ParameterError for values that the running loops cannot take up."""
         for joint in self.joints:
             joint.check_change(p.of_joint(joint.name))
 

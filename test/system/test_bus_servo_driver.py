@@ -1,6 +1,6 @@
 """The driver of bus servos beside an emulated bus: messages, silence, a pulled plug, the end.
 
-Ten minutes at 100 Hz, with the counts: BUS_RATE=100 BUS_CYCLES=60000 pytest -s on this file.
+Ten minutes at 100 Hz, with the counts: BUS_RATE=100 BUS_CYCLES=60000 pytest -s --timeout=0.
 """
 
 import math

@@ -341,7 +341,6 @@ class ControlLoop:
         self._gap, self._ending = NEXT_SAMPLE, iter(())
 
     def _go_on_from(self, told: float) -> None:
-        """Take this v for the one that acts."""
         v = self.core.limits.go_on_from(told, self.v if self.knows_v else None)
         if v != self.v:
             self.core.motion = at_rest(v)

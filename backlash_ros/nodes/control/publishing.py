@@ -125,7 +125,6 @@ class StepPublisher:
 
 
 def _rows(loop: ControlLoop, step: ControlStep | None) -> tuple[Row, Row]:
-    """Signals and estimates of a joint."""
     if step is None:
         return (nan,) * len(topics.SIGNAL_LABELS), (nan,) * len(topics.ESTIMATE_LABELS)
     e, sample, law = step.estimate, float(loop.counter.index), loop.core.estimator
