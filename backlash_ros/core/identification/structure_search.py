@@ -7,11 +7,11 @@ A pole that a zero cancels is none: such a structure gives way to the same one w
 for it would predict only what no G makes. Structures whose held-out error is within a few percent
 of the least, or within its own deviation, are equally good predictors. Among them the least
 
-    N' log(squares) + unknowns log(N)
+    N' log(squares) + unknowns log(N')
 
 over all samples is taken (BIC), with N' = N (1 - r) / (1 + r) for the lag-1 correlation r of the
 residual. No error is less than what the simulation rounds. A structure with an oscillation that
-outlasts the record is taken only where all have one.
+outlasts the record, or that leaves more than y itself, is taken only where all do so.
 """
 
 from __future__ import annotations
@@ -248,7 +248,7 @@ def _with_criteria(compared: Iterable[Compared]) -> list[Compared]:
     return [one._replace(
         held_out=max(one.held_out, rounded),
         criterion=rows * log(max(one.whole.squares, rounded**2 * count, TINY))
-        + one.structure.unknowns * log(count),
+        + one.structure.unknowns * log(max(rows, 1.0)),
     ) for one in compared]
 
 
@@ -275,9 +275,17 @@ def selected(compared: Sequence[Compared]) -> Compared:
 
 
 def eligible(compared: Sequence[Compared]) -> list[Compared]:
-    """Structures that were fitted to the end, without those that ring if there are others."""
-    fitted_to_end = [one for one in compared if np.isfinite(one.criterion)]
-    return [one for one in fitted_to_end if not rings(one.whole)] or fitted_to_end
+    """Structures that were fitted to the end, without those that are no model if there are others.
+    """
+    found = [one for one in compared if np.isfinite(one.criterion)]
+    for useless in (explains_nothing, rings):
+        found = [one for one in found if not useless(one.whole)] or found
+    return found
+
+
+def explains_nothing(found: Model) -> bool:
+    """Whether it leaves more than there is of y, however well its last part is predicted anew."""
+    return found.squares > float(found.problem.y @ found.problem.y)
 
 
 def rings(found: Model) -> bool:

@@ -124,3 +124,16 @@ def test_noise_that_lasts_leaves_a_wider_gap_than_white_noise() -> None:
 def test_models_that_fit_alike_tell_a_deviation_and_others_none() -> None:
     assert by_model(1.0, [(1.2, -3.0), (1.3, 4.0), (9.0, 4.1)]) == pytest.approx(0.2)
     assert by_model(1.0, []) == 0.0
+
+
+def test_a_fit_that_leaves_more_than_y_itself_is_taken_only_where_all_do() -> None:
+    v = np.zeros(50)
+    samples = Samples(v, np.sin(np.arange(50.0)), 1, 50, 0.0)
+    structures = [Structure(0, 0, False), Structure(1, 0, False)]
+    # A gain of 0 for an offset of 0 and of 9.
+    still, off = (Model(one, samples.problem(one), WindowFit(
+        np.zeros(1), 0.0, np.concatenate([[1.0, offset, 1.0], one.xi(np.ones(1), np.zeros(
+            one.free_poles))]), 1.0)) for one, offset in zip(structures, (0.0, 9.0), strict=True))
+    good, bad = compared(still, 1.0, -10.0), compared(off, 0.1, 50.0)
+    assert selected([good, bad]) is good
+    assert selected([bad]) is bad
