@@ -194,7 +194,7 @@ def excess(setup: Setup, record: Window, problem: Problem, fit: WindowFit) -> in
     if drifts or count >= settings.LONGEST:
         return count // 3
     turns = reversals(engaged(record.v, problem.at(fit).p, fit.gap))
-    if count < settings.LIVELY or len(turns) <= settings.HELD_REVERSALS:
+    if count < settings.ROWS or len(turns) <= settings.HELD_REVERSALS:
         return 0
     cut = min(count // 3, int(turns[-settings.HELD_REVERSALS]) - 1)
     return cut if cut >= count // 6 else 0

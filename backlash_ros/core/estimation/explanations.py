@@ -303,19 +303,19 @@ def are_precise(setup: Setup, crossings: Array, cov: Array, systematic: bool) ->
 
     systematic: whether residuals are correlated.
     """
-    factor = 1.0 / settings.SYSTEMATIC if systematic else 1.0
+    factor = 1.0 / settings.BY_CHANCE if systematic else 1.0
     m, c_r, c_l = map(float, crossings)
     std_m, *std = map(float, np.sqrt(np.maximum(np.diag(cov), 0.0)))
     gap, gap_std = c_r - c_l, sqrt(max(float(cov[1, 1] + cov[2, 2] - 2.0 * cov[1, 2]), 0.0))
     gap_known = max(gap_std, *std) < factor * settings.STD_GAP * gap
     chance = settings.BY_CHANCE * gap_std
-    no_gap = gap < chance and gap + chance < settings.NO_GAP * setup.guess
+    no_gap = gap < chance and gap + chance < settings.NEGLIGIBLE * setup.guess
     return std_m < factor * settings.STD_SLOPE * m and (gap_known or no_gap)
 
 
 def moves_unexplained(setup: Setup, f: WindowFit) -> bool:
     """Whether y moves by more than is tolerated in a way that no G makes, where G is uncertain."""
-    return f.systematic and f.unexplained > settings.UNEXPLAINED and setup.family.count > 0
+    return f.systematic and f.unexplained > settings.NEGLIGIBLE and setup.family.count > 0
 
 
 def noisier(setup: Setup, f: WindowFit) -> bool:

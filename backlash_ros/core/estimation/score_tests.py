@@ -85,7 +85,7 @@ def likelier(problem: Problem, fit: WindowFit, record: Window, since: int, back:
     reach = memory_of(float(modes[modes < 1.0 - ON_CIRCLE].max(initial=0.0)))
     known = problem.known.astype(np.float64)
     q = _basis(problem.jacobian(fit) * known[:, None])
-    residual = problem.at(fit).error
+    residual = problem.at(fit).error.copy()
     # Correlated residuals are for the most part made by the commands that are looked for.
     noise = fit.noise * (own_noise if fit.systematic else 1.0)
     noise = max(noise, problem.nominal, problem.step_of_readings / sqrt(12.0))

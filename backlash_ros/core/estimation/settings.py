@@ -7,16 +7,14 @@ from __future__ import annotations
 
 # --- what counts as known
 STD_SLOPE = 0.2  # standard deviation of m over m, below which an estimate is published
-STD_GAP = 0.3  # standard deviation of gap and crossings over the gap, below which it is published
-SYSTEMATIC = 3.0  # factor by which both are smaller while residuals are correlated
-NO_GAP = 0.1  # upper end of a gap that counts as none, over the gap of the first guess
+STD_GAP = 0.3  # that of gap and crossings over the gap; both for BY_CHANCE deviations if correlated
 REVERSALS = 2  # changes of the engaged side before a first estimate where G is uncertain
-UNEXPLAINED = 0.1  # motion that nothing explains, over m times the gap, that is tolerated
+NEGLIGIBLE = 0.1  # motion that nothing explains, or a gap, that counts as none: over the gap
 LOST_MOTION = 0.02  # by which the gap of a gear differs from one motion to another, over the gap
 
 # --- when an explanation counts
 CHANCE = 1e-3  # probability below which a difference between two estimates is no chance
-BY_CHANCE = 3.0  # standard deviations by which an estimate may lie beyond a bound
+BY_CHANCE = 3.0  # standard deviations by which an estimate may be off by chance
 FAR_BEHIND = 30.0  # log-likelihood by which a candidate, or no walk of u, is given up
 ENGAGED = 15.0  # log-likelihood by which a backlash must beat a constant u
 GATE = 6.0  # standard deviations beyond which a reading is an outlier
@@ -32,10 +30,8 @@ LASTING = 8.0  # times what it had to predict, over which an explanation holds f
 FIRST_FIT = 20  # samples before the first search
 SHORT_RECORD = 400  # samples of a record in which other gaps are looked for again
 GROWTH = 1.25  # of the record from one search to the next
-SEARCHED = 2.0  # of one of many reversals that a search has not explained
 BLOCKS = 16  # refits while the record doubles: one for so many of its samples
 FEWEST = 8  # samples between two refits
-LIVELY = 1500  # samples that are kept though fewer hold enough reversals
 HELD_REVERSALS = 6  # reversals that the record holds, however long they take
 LONGEST = 120_000  # samples of the record, at most
-ROWS = 1500  # rows that a search averages the record to, samples that tell the state of a G
+ROWS = 1500  # samples, or rows that they are averaged to, that tell what can be told of a motion

@@ -93,7 +93,7 @@ def _searching(setup: Setup, record: Window, before: Belief) -> Belief:
         return replace(before, end=record.end, next_at=soon)
     # What many reversals do not tell, a few more will not.
     lasting = tried is not None and tried.left.turns >= settings.HELD_REVERSALS
-    growth = settings.SEARCHED if lasting else settings.GROWTH
+    growth = 2.0 if lasting else settings.GROWTH
     search_at = record.end + max(int(count * (growth - 1.0)), FEWEST)
     found = afresh(setup, record, also=tried, walks=True)
     part = shorter = record
@@ -159,7 +159,7 @@ def _why(setup: Setup, found: WindowFit | None, record: Window, before: Belief) 
         return Status.INCONSISTENT if crosses else Status.NOT_EXCITED
     # Until v has swung past the gap a fit may have none: the gap of the first guess counts then.
     gap = max(found.gap, setup.guess)
-    large = found.unexplained * found.gap > settings.UNEXPLAINED * gap \
+    large = found.unexplained * found.gap > settings.NEGLIGIBLE * gap \
         or record.turns(gap, float(record.v[0])) >= settings.HELD_REVERSALS
     wrong = found.m < 0.0 or (large and _leaves_more(setup, found))
     contradicts = before.published and is_known(setup, found, found.left.turns)
