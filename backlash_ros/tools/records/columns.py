@@ -17,16 +17,22 @@ PATTERNS: Mapping[str, Sequence[str]] = {
         r'date|datum',
     ),
     'v': (
-        r'v', r'command|cmd|control|goal|target|set ?point|sp|op|soll(wert)?|u|input',
-        r'(.* )?(goal|target|commanded|commands?|cmd|desired|des|set ?point|set|soll\w*|control)'
-        r'( .*)?', r'ref(erence)?( .*)?|.* (ref(erence)?|u|v|input)',
+        r'v', r'command|cmd|control|goal|target|set ?point|demand|sp|op|soll(wert)?|u|input',
+        r'(.* )?(goal|target|commanded|commands?|cmd|desired|des|set ?point|set|demand|soll\w*'
+        r'|control)( .*)?', r'ref(erence)?( .*)?|.* (ref(erence)?|u|v|d|input)',
+        r'(.* )?motor( .*)?',
     ),
     'y': (
-        r'y', r'position|pos|actual|measured|present|feedback|output|encoder|angle|pv|ist(wert)?',
+        r'y', r'position|pos|actual|measured|present|feedback|output|encoder|angle|pv|process value'
+        r'|ist(wert)?',
         r'(.* )?(actual|present|measured|meas|feedback|ist\w*)( .*)?',
         r'(.* )?(positions?|pos|output|encoder|angle|theta|q)( .*)?|.* y',
     ),
 }
+# What is neither v nor y, whatever else its name says.
+OTHERS = r'.*\b(qd|dq|speed|velocity|vel|(load|current)(?! (pos(ition)?|angle|encoder))|torque' \
+         r'|effort|temp(erature)?|voltage|status|moving|err(or)?|acceleration|acc|power|rate' \
+         r'|direction|duration)\b.*'
 UNITS_S = {
     unit: scale for scale, units in {
         1e-9: 'ns nsec nanoseconds', 1e-6: 'us µs μs usec microseconds micros',
@@ -61,6 +67,8 @@ def choose_columns(names: Sequence[str], given: Mapping[str, str]) -> tuple[dict
     found = dict(given)
     for role, meant in (('t', 'the time'), ('v', 'the command'), ('y', 'the output')):
         fitting = [found[role]] if role in found else _fitting(role, names, found)
+        if not fitting and role != 't':
+            fitting = _left_over(names, found, 'y' if role == 'v' else 'v')
         if len(fitting) == 1:
             found[role] = fitting[0]
         elif role != 't' or fitting:
@@ -89,13 +97,18 @@ def unit_of(name: str) -> float | None:
 
 def _fitting(role: str, names: Sequence[str], taken: Mapping[str, str]) -> list[str]:
     """Columns that may be this, of the surest pattern that fits any."""
-    # What is neither v nor y, whatever else its name says.
-    others = r'.*\b(qd|dq|speed|velocity|vel|load|current|torque|effort|temp(erature)?|voltage|' \
-             r'status|moving|err(or)?|acceleration|acc|power|rate|direction|duration)\b.*'
     words = {name: _words(name) for name in names if name not in taken.values()}
     found = ([name for name, text in words.items() if re.fullmatch(pattern, text)
-              and (role == 't' or not re.fullmatch(others, text))] for pattern in PATTERNS[role])
+              and (role == 't' or not re.fullmatch(OTHERS, text))] for pattern in PATTERNS[role])
     return next(filter(None, found), [])
+
+
+def _left_over(names: Sequence[str], taken: Mapping[str, str], other: str) -> list[str]:
+    """The one of three columns that is nothing else, nor the other one of v and y; [] for none."""
+    neither = {*taken.values(), *_fitting(other, names, taken)}
+    left = [name for name in names
+            if name not in neither and not re.fullmatch(OTHERS, _words(name))]
+    return left if len(names) == 3 and len(left) == 1 else []
 
 
 def _words(name: str) -> str:

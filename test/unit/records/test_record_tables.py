@@ -2,6 +2,7 @@
 
 import gzip
 import sys
+from itertools import permutations
 from pathlib import Path
 
 import numpy as np
@@ -147,6 +148,8 @@ def test_columns_without_names_go_by_their_number(tmp_path: Path) -> None:
     (('t', 'voltage', 'y'), 'no column is v'), (('t', 'v', 'speed'), 'no column is y'),
     (('t', 'time', 'v', 'y'), ''), (('time', 'stamp', 'v', 'y'), 'several columns may be t'),
     (('t', 'command', 'cmd', 'y'), 'several columns may be v'),
+    (('t', 'xd', 'x'), 'no column is v'), (('t', 'load', 'position'), 'no column is v'),
+    (('t', 'command', 'current'), 'no column is y'),
 ])
 def test_names_that_may_mean_several_columns_are_asked_for(names, said):
     if not said:
@@ -156,6 +159,17 @@ def test_names_that_may_mean_several_columns_are_asked_for(names, said):
         choose_columns(names, {})
     assert '--columns "t=…,v=…,y=…"' in str(told.value)
     assert all(name in str(told.value) for name in names)
+
+
+@pytest.mark.parametrize('names', [
+    ('time', 'target_position', 'current_position'), ('time', 'motor_cmd', 'load_pos'),
+    ('time', 'motor_angle', 'load_angle'), ('time', 'setpoint', 'process_value'),
+    ('time', 'valve_demand', 'valve_position'), ('t', 'x_cmd', 'x'), ('time', 'q_d', 'q'),
+    ('stamp', 'pwm', 'position'),
+])
+def test_names_that_people_give_are_understood(names: tuple[str, str, str]) -> None:
+    for order in permutations(names):
+        assert choose_columns(order, {})[0] == dict(zip('tvy', names, strict=True))
 
 
 @pytest.mark.parametrize(('text', 'given'), [
