@@ -9,7 +9,6 @@ Every row is a fixed set of seeded runs, and its figures have the scatter that o
 show. What is worse than in the reference by more than three standard deviations ends it with 1.
 """
 
-import argparse
 import json
 import os
 import sys
@@ -27,7 +26,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import faults
 import ordinary_motions
-from contract import crossing_rows, following_rows, learning_rows, situation_rows, timing_rows
+from contract import following_rows, learning_rows, situation_rows, timing_rows
 from contract.figures import COMPARED_HEADER, Figure, Row, as_json, compare, show
 from reporting import ROOT, machine, markdown_table, parser_of
 from tqdm import tqdm
@@ -69,7 +68,7 @@ ROWS: dict[str, Measured] = {
        for loop, structure in (('open', 'proportional'), ('closed', 'tracking'))},
     'changes': row_of(learning_rows, 'changes', 'run_job'),
     'following': row_of(following_rows, 'following'),
-    'crossings': row_of(crossing_rows, 'crossings'),
+    'crossings': row_of(following_rows, 'crossings'),
     'late': row_of(situation_rows, 'late'),
     'faults': Measured(situation_rows.faults_jobs, faults.play, situation_rows.faults_figures),
     'identification': row_of(situation_rows, 'identification'),
@@ -103,28 +102,6 @@ def _processor_s() -> float:
 def _prepare() -> None:
     os.nice(NICENESS)
     warnings.simplefilter('ignore')
-
-
-def parse_arguments() -> argparse.Namespace:
-    parser = parser_of(__doc__)
-    parser.add_argument('--only', nargs='+', metavar='ROW', default=list(ROWS),
-                        help=f'of: {"; ".join(ROWS)}')
-    parser.add_argument('--scale', type=float, default=1.0,
-                        help='times as many runs as in the reference')
-    parser.add_argument('--workers', type=int, default=WORKERS, metavar='N',
-                        help=f'processes beside each other, default {WORKERS}')
-    parser.add_argument('--out', type=Path, default=RESULT,
-                        help='rows that it holds and that are not measured now stay in it')
-    parser.add_argument('--reference', action='store_true',
-                        help=f'write these rows into {REFERENCE.relative_to(ROOT)}')
-    parser.add_argument('--compare', type=Path, default=REFERENCE, metavar='FILE',
-                        help='another reference')
-    arguments = parser.parse_args()
-    if unknown := [name for name in arguments.only if name not in ROWS]:
-        parser.error(f'--only {unknown[0]!r} must be of: {"; ".join(ROWS)}')
-    if not (arguments.scale > 0.0 and arguments.workers > 0):
-        parser.error('--scale and --workers must be > 0')
-    return arguments
 
 
 def read_rows(path: Path) -> dict[str, Row]:
@@ -166,8 +143,23 @@ def adopt(rows: dict[str, Row]) -> None:
 
 
 def main() -> int:
-    arguments = parse_arguments()
-    before = read_rows(arguments.compare)
+    parser = parser_of(__doc__)
+    parser.add_argument('--only', nargs='+', metavar='ROW', default=list(ROWS),
+                        help=f'of: {"; ".join(ROWS)}')
+    parser.add_argument('--scale', type=float, default=1.0,
+                        help='times as many runs as in the reference')
+    parser.add_argument('--workers', type=int, default=WORKERS, metavar='N',
+                        help=f'processes beside each other, default {WORKERS}')
+    parser.add_argument('--out', type=Path, default=RESULT,
+                        help='rows that it holds and that are not measured now stay in it')
+    parser.add_argument('--reference', action='store_true',
+                        help=f'write these rows into {REFERENCE.relative_to(ROOT)}')
+    arguments = parser.parse_args()
+    if unknown := [name for name in arguments.only if name not in ROWS]:
+        parser.error(f'--only {unknown[0]!r} must be of: {"; ".join(ROWS)}')
+    if not (arguments.scale > 0.0 and arguments.workers > 0):
+        parser.error('--scale and --workers must be > 0')
+    before = read_rows(REFERENCE)
     rows: dict[str, Row] = {}
     for name in filter(arguments.only.__contains__, ROWS):
         begun, used = time.monotonic(), _processor_s()

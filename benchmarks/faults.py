@@ -11,7 +11,6 @@ core, the bookkeeping of samples and commands, and what the node decides around 
 import json
 import os
 import sys
-import time
 import warnings
 from contextlib import nullcontext
 from multiprocessing import Pool
@@ -97,8 +96,6 @@ def main() -> int:
     parser.add_argument('--first-seed', type=int, default=FIRST_SEED, metavar='S')
     parser.add_argument('--seed', type=int, metavar='K', help='show what happens in this one')
     parser.add_argument('--processes', type=int, default=processors())
-    parser.add_argument('--seconds', type=float, default=float('inf'),
-                        help='begin no further sequence after so long')
     parser.add_argument('--results', type=Path, metavar='FILE',
                         help='append what comes out; what it holds already is not played again')
     parser.add_argument('--write', action='store_true',
@@ -107,7 +104,6 @@ def main() -> int:
     if arguments.seed is not None:
         return show(arguments.seed)
     first = arguments.first_seed
-    deadline = time.monotonic() + arguments.seconds
     wanted = range(first, first + arguments.sequences)
     results = [result for result in read_results(arguments.results) if result.seed in wanted]
     known = {result.seed for result in results}
@@ -120,9 +116,6 @@ def main() -> int:
                 print(json.dumps(result), file=file, flush=True)
             for kind, text in result.found.items():
                 print(f'{result.seed} ({result.loop}) {kind}: {text}', flush=True)
-            if time.monotonic() > deadline:
-                pool.terminate()
-                break
     said, table = summary(results, first), (('found', 'sequences', 'seeds'), rows_of(results))
     print(f'{said}\n{format_table(*table)}')
     if arguments.write:

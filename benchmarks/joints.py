@@ -121,11 +121,11 @@ class Driver(MeasuringNode):
         else:
             for publisher, value in zip(self._references, y_m, strict=True):
                 publisher.publish(Float64(data=value))
-        self._wait_until(begin + 0.5 * period_s)
+        self.wait_till(begin + 0.5 * period_s)
         asked, echoed = time.perf_counter(), self.echoed
         self._question.publish(Float64(data=y[0]))
         echoed_s = self._time_until(lambda: self.echoed > echoed, asked, begin + period_s)
-        self._wait_until(begin + period_s)
+        self.wait_till(begin + period_s)
         for plant, v in zip(self._plants, self._v, strict=True):
             plant.step(v)
         return answered_s, echoed_s
@@ -137,10 +137,6 @@ class Driver(MeasuringNode):
                 return np.nan
             self.executor.serve_urgent(int(1e9 * left))
         return time.perf_counter() - asked
-
-    def _wait_until(self, end: float) -> None:
-        while (left := end - time.perf_counter()) > 0.0:
-            self.executor.serve_urgent(int(1e9 * left))
 
 
 def measure(together: bool, law: str, rate: float, seconds: float) -> list[str]:

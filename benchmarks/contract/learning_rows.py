@@ -3,16 +3,75 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
+from math import copysign, pi
 from typing import Any, NamedTuple
 
 import numpy as np
-from cases.coasting_load import CoastingLoad
 from cases.loops import motor, random_backlash
 from cases.random_cases import bound_of, cramer_rao, random_case, uncertain_case
+from contract.figures import (
+    Array,
+    Figure,
+    Judged,
+    by_group,
+    figure,
+    figures_of,
+    judged,
+    rms,
+    share,
+    upper,
+)
 
 from backlash_ros.core import Parameters, Status, build_closed_loop, build_plant
-from contract.figures import Array, Figure, by_group, figure, rms, share, upper
-from contract.judged import Judged, figures_of, judged
+from backlash_ros.core.plant.backlash import Backlash
+
+STEP_S = 0.25e-3  # of the integration
+
+
+class CoastingLoad:
+    """A load that goes on within the gap, with the interface of SimulatedPlant.
+
+    J x'' = k z - b x' - friction,  z = p - x - m c_r if > 0,  p - x - m c_l if < 0,  else 0
+    with p = m v, w^2 = k/J and 2 d w = b/J; v moves evenly within a sample.
+    frequency: of the contact [Hz]. damping: ratio d of the viscous friction. dry: deceleration by
+    dry friction [unit of y / s^2]. quantum: of the sensor, 0 for none [unit of y].
+    """
+
+    def __init__(
+        self, backlash: Backlash, period_s: float, frequency: float = 20.0, damping: float = 0.5,
+        dry: float = 0.0, quantum: float = 0.0,
+    ) -> None:
+        self.backlash = backlash  # what a play between the same parts would let through
+        self.sample = 0
+        self._stiffness = (2.0 * pi * frequency) ** 2
+        self._viscous = 4.0 * pi * damping * frequency
+        self._dry, self._quantum = dry, quantum
+        self._steps = round(period_s / STEP_S)
+        self._v = self._x = self._speed = 0.0
+
+    def measure(self) -> float:
+        return self._quantum * round(self._x / self._quantum) if self._quantum else self._x
+
+    def step(self, v: float) -> float:
+        """Move the input to v over one sample period; return the output of a play."""
+        for i in range(1, self._steps + 1):
+            self._advance(self._v + (v - self._v) * i / self._steps)
+        self._v = v
+        self.sample += 1
+        return self.backlash.step(v)
+
+    def _advance(self, v: float) -> None:
+        play = self.backlash
+        right, left = play.m * (v - play.c_r) - self._x, play.m * (v - play.c_l) - self._x
+        depth = right if right > 0.0 else min(left, 0.0)
+        push = self._stiffness * depth - self._viscous * self._speed
+        if self._speed == 0.0 and abs(push) <= self._dry:
+            return
+        moved = self._speed + STEP_S * (push - copysign(self._dry, self._speed or push))
+        # Dry friction stops the load and does not turn it round.
+        self._speed = 0.0 if moved * self._speed < 0.0 and abs(push) <= self._dry else moved
+        self._x += STEP_S * self._speed
+
 
 Changes = dict[str, Any]
 
@@ -99,7 +158,6 @@ def _beside_bound(p: Parameters, run: Any, marks_s: Sequence[float]) -> tuple[Ar
 
 
 # The paper's example with exact G, beside the Cramér-Rao bound; and with samples that are lost.
-
 BOUND_MARKS_S = (1.0, 2.0, 6.0)
 
 
@@ -135,7 +193,6 @@ def bound_figures(outcomes: Sequence[Outcome]) -> dict[str, Figure]:
 
 
 # The geared motor with plants that are not the nominal one.
-
 DIFFERENT: dict[str, Changes] = {
     'exact': {},
     **{f'ω × {f:g}': {'truth.scale_frequency': f} for f in (0.8, 0.9, 0.98, 1.02, 1.1, 1.2)},
@@ -185,7 +242,6 @@ def plants_figures(outcomes: Sequence[Outcome]) -> dict[str, Figure]:
 
 
 # Random plants, gaps, first guesses and references, three periods each.
-
 RANDOM_KINDS = ('exact', 'next to no noise', 'time constants 10 % off')
 
 
@@ -229,7 +285,6 @@ def random_figures(outcomes: Sequence[RandomOutcome]) -> dict[str, Figure]:
 
 
 # Backlashes that change, physics that is none of the model, rest.
-
 COASTING: dict[str, list[dict[str, float]]] = {
     'd = 0.5': [{'damping': 0.5}],
     'lightly damped': [{'damping': 0.1}, {'damping': 0.02}, {'damping': 0.1, 'dry': 20.0}],

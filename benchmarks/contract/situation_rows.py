@@ -14,6 +14,7 @@ import yaml
 from cases.held_up import HeldUpProcesses
 from cases.identification_cases import NO_PLAYS, Case, random_case, without_play
 from cases.loops import flat, motor
+from contract.figures import Array, Figure, by_group, figure, share, upper
 from faults import Result
 from gears import gear_runs
 from gears.gear_runs import PRESETS, Gear, close_loop, gear_of
@@ -21,10 +22,8 @@ from gears.gear_runs import PRESETS, Gear, close_loop, gear_of
 from backlash_ros.core import Estimate, Parameters, Status, build_controller, fit_record
 from backlash_ros.core.plant.transfer_function import TransferFunction
 from backlash_ros.tools.identify.command import main as identify
-from contract.figures import Array, Figure, by_group, figure, share, upper
 
 # Late commands: driver and controller held up by a busy machine, in simulated time.
-
 HELD_UP_S = 6.0
 
 
@@ -60,7 +59,6 @@ def late_figures(runs: Sequence[HeldUp]) -> dict[str, Figure]:
 
 
 # Sequences of faults.
-
 HURT = ('outside', 'too_fast', 'jumps', 'unbounded', 'broken')
 FIRST_SEQUENCE = 101
 
@@ -81,8 +79,6 @@ def faults_figures(results: Sequence[Result]) -> dict[str, Figure]:
 
 
 # Identification.
-
-
 class Found(NamedTuple):
     """What `identify` found: identified.json, and parameters of identified.yaml."""
 
@@ -197,7 +193,6 @@ def identification_figures(runs: Sequence[Identified]) -> dict[str, Figure]:
 
 
 # Gears that MuJoCo integrates: identified within their limits, then closed to loops.
-
 MOTIONS = ('sine', 'triangle', 'moves and rests')
 INERTIAS, BANDWIDTHS = (0.02, 0.3, 3.0), (4.0, 14.0, 60.0)
 OFF = 0.1  # error of the gap from which on *tracking* is wrong, in lost motions

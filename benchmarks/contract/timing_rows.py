@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from cases.loops import motor
+from contract.figures import Array, Figure, figure
 from real_time.loop_latency import measure_latency
 from real_time.step_times import Sampled, filter_timer
 from scipy.optimize import least_squares
@@ -22,7 +23,6 @@ from scipy.signal import lfilter
 
 from backlash_ros.core import Parameters, build_closed_loop
 from backlash_ros.core.plant.backlash import play
-from contract.figures import Array, Figure, figure
 
 LEAST_SCATTER = 0.05  # relative, of a time: what one run of a machine does not show
 QUANTILES = {'p50': 0.5, 'p99': 0.99}

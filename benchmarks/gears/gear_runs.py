@@ -112,10 +112,9 @@ def record(gear: Gear, seconds: float = STROKES_S) -> tuple[Array, Array, Array]
 
     motor: that at the end of the interval in which v acts, as a driver reports it.
     """
-    physics, period = GearPhysics(gear), gear.sample_period
+    physics, period, rows = GearPhysics(gear), gear.sample_period, []
     reach, rate = gear.scale * gear.reach, gear.scale * gear.rate
     physics.advance(SETTLING_S)
-    rows = []
     for v in islice(strokes(-reach, reach, rate, period, seconds, 0.0), round(seconds / period)):
         y = physics.load_encoder()
         physics.move_to(v)

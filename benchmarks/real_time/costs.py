@@ -47,8 +47,7 @@ class Driver(MeasuringNode):
             self._y.publish(Float64(data=self._plant.measure()))
             self._number.publish(Float64(data=self._v))
             next_s = max(next_s + self._period_s, time.perf_counter())
-            while (left := next_s - time.perf_counter()) > 0.0:
-                self.executor.serve_urgent(int(1e9 * left))
+            self.wait_till(next_s)
             self._plant.step(self._v)
 
     def wait_for_command(self) -> float:

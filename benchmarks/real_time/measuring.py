@@ -100,6 +100,11 @@ class MeasuringNode:
                 return
             self.spin(0.02)
 
+    def wait_till(self, time_s: float) -> None:
+        """Listen until then, by time.perf_counter."""
+        while (left := time_s - time.perf_counter()) > 0.0:
+            self.executor.serve_urgent(int(1e9 * left))
+
     def close(self) -> None:
         self.executor.shutdown()
         self.node.destroy_node()

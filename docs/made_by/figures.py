@@ -13,12 +13,10 @@ from typing import Any
 sys.path.append(str(Path(__file__).resolve().parents[2] / 'benchmarks'))
 
 import numpy as np
-from generate_parameters import write_parameters
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from reporting import write_between
-from runs import WITHOUT, simulate
-from tables import TABLES
+from tables import TABLES, WITHOUT, simulate, write_parameters
 
 from backlash_ros.core.simulation.metrics import delayed_reference
 from backlash_ros.core.simulation.run_record import RunRecord
@@ -96,14 +94,12 @@ def draw_figure_4() -> Figure:
 def draw_figure_5() -> Figure:
     """Control errors of the laws on the paper's example, as Figure 5."""
     run = simulate(5.0)
-    curves, window_s, _ = compare_laws(run.record, run.parameters)
-    return drawn.draw_error_curves(curves, window_s)
+    return drawn.draw_error_curves(*compare_laws(run.record, run.parameters)[:2])
 
 
 def draw_loop() -> Figure:
     run = simulate(5.0)
-    _, end = interesting_parts(run.record, run.parameters)
-    return drawn.draw_hysteresis(run.record, end)
+    return drawn.draw_hysteresis(run.record, interesting_parts(run.record, run.parameters)[1])
 
 
 def draw_uncertain_plant() -> Figure:

@@ -4,55 +4,29 @@ import sys
 from dataclasses import replace
 from math import cos, pi, radians, sin
 from pathlib import Path
-from typing import Any, NamedTuple
+
+sys.path.append(str(Path(__file__).resolve().parents[2] / 'benchmarks'))
 
 import numpy as np
+from gears.gear_runs import PRESETS, close_loop, constant, identified
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Patch, Rectangle
 from matplotlib.transforms import Affine2D
-from numpy.typing import NDArray
 from PIL import Image
-
-sys.path.append(str(Path(__file__).resolve().parents[2] / 'benchmarks'))
-
-from gears.gear_runs import PRESETS, Run, close_loop, constant, identified
 from reporting import ROOT, save_film
 
 from backlash_ros.core.assembly import build_controller
 from backlash_ros.core.estimate import Status
 
-Array = NDArray[np.float64]
-
+GEAR = replace(PRESETS['servo'], swing=0.04)  # [rad]
+PERIOD_S, SINE_S = GEAR.sample_period, 1.0 / GEAR.frequency  # errors are averaged over a sine
 PERIODS = 4  # of a sine with the frequency of the preset
 MAGNIFIED = 20.0  # times which angles are drawn larger
 FRAME_S = 0.06  # a multiple of 0.01 s, as GIF wants it
-WITHOUT_COLOUR, WITH_COLOUR = '#D55E00', '#0072B2'
-PART_COLOURS = {'motor': '#cc7a00', 'load': '#1a66cc', 'reference': '#1a1a1a'}
-
-
-GEAR = replace(PRESETS['servo'], swing=0.04)  # [rad]
-PERIOD_S, SINE_S = GEAR.sample_period, 1.0 / GEAR.frequency  # errors are averaged over a sine
-
-
-class Films(NamedTuple):
-    """Both loops. samples: until the reference, which is followed late, is where it began."""
-
-    without: Run
-    learned: Run
-    samples: int
-
-
-def run_loops() -> Films:
-    """Identify the servo, and close the loop with a gap of 0, for good and to begin with."""
-    parameters = identified(GEAR, encoder=False).parameters
-    assert parameters is not None
-    unknown = parameters.replaced({'estimator.initial.c_r': 0.0, 'estimator.initial.c_l': 0.0})
-    without = constant(parameters, parameters.estimator.initial.m, 0.0, 0.0)
-    runs = [close_loop(GEAR, controller, 'sine', periods=PERIODS + 1)
-            for controller in (without, build_controller(unknown))]
-    return Films(*runs, round(PERIODS * SINE_S / PERIOD_S) + without.structure.delay)
+SIDES = ((0.0, '#D55E00', 'without compensation'), (0.5, '#0072B2', 'with backlash_ros'))
+MOTOR, LOAD, REFERENCE = '#cc7a00', '#1a66cc', '#1a1a1a'
 
 
 class View:
@@ -63,88 +37,71 @@ class View:
         axes.axis('off')
         axes.set(xlim=(-1.4, 1.4), ylim=(-1.05, 1.05), aspect='equal')
         axes.add_patch(Circle((0.0, 0.0), 1.02, color='#edf0f2'))
-        step = radians(MAGNIFIED)  # one for each degree as it is
-        for k in range(-round(0.5 * pi / step), round(0.5 * pi / step) + 1):
-            x, y = sin(k * step), cos(k * step)
+        ticks = round(0.5 * pi / radians(MAGNIFIED))  # one for each degree as it is
+        for angle in radians(MAGNIFIED) * np.arange(-ticks, ticks + 1):
+            x, y = sin(angle), cos(angle)
             axes.plot((0.95 * x, x), (0.95 * y, y), color='#73808c', linewidth=2.0)
         # The pin touches a prong once the angle between motor and load is half of the gap.
-        pin, pin_at, prong = 0.04, 0.47, 0.03
-        beside = pin + pin_at * sin(0.5 * PRESETS['servo'].gap * MAGNIFIED) + prong
-        motor, load, reference = PART_COLOURS.values()
-        self._parts = {'motor': [
-            Circle((0.0, 0.0), 0.19, color=motor),
-            _box(0.0, -0.22, beside + prong, 0.05, motor),
-            *(_box(side * beside, -0.42, prong, 0.18, motor) for side in (-1.0, 1.0)),
-        ], 'load': [
-            _box(0.0, 0.43, 0.03, 0.43, load), Circle((0.0, 0.0), 0.11, color=load),
-            _box(0.0, -0.5 * pin_at, 0.03, 0.5 * pin_at, load),
-            Circle((0.0, -pin_at), pin, color=load),
-        ], 'reference': [
-            _box(0.0, 0.49, 0.007, 0.49, reference), _box(0.0, 0.95, 0.035, 0.05, reference),
-        ]}
-        for patch in (patch for patches in self._parts.values() for patch in patches):
-            axes.add_patch(patch)
+        beside = 0.07 + 0.47 * sin(0.5 * GEAR.gap * MAGNIFIED)
+        # Middle, half width and height of boxes, or the radius of a circle.
+        self._parts = [[self._drawn(colour, *shape) for shape in shapes] for colour, shapes in (
+            (MOTOR, ((0.0, 0.0, 0.19), (0.0, -0.22, beside + 0.03, 0.05),
+                     (-beside, -0.42, 0.03, 0.18), (beside, -0.42, 0.03, 0.18))),
+            (LOAD, ((0.0, 0.43, 0.03, 0.43), (0.0, 0.0, 0.11), (0.0, -0.235, 0.03, 0.235),
+                    (0.0, -0.47, 0.04))),
+            (REFERENCE, ((0.0, 0.49, 0.007, 0.49), (0.0, 0.95, 0.035, 0.05))))]
 
-    def turn(self, part: str, angle: float) -> None:
-        """Show a part at an angle [rad], clockwise."""
-        turned = Affine2D().rotate(-MAGNIFIED * angle) + self._axes.transData
-        for patch in self._parts[part]:
-            patch.set_transform(turned)
+    def _drawn(self, colour: str, x: float, y: float, w: float, h: float = 0.0) -> Patch:
+        return self._axes.add_patch(
+            Rectangle((x - w, y - h), 2.0 * w, 2.0 * h, color=colour) if h
+            else Circle((x, y), w, color=colour))
 
-
-def _box(x: float, y: float, half_width: float, half_height: float, colour: str) -> Patch:
-    return Rectangle((x - half_width, y - half_height), 2.0 * half_width, 2.0 * half_height,
-                     color=colour)
-
-
-class Frames:
-    def __init__(self, films: Films) -> None:
-        figure = Figure((8.0, 5.2), dpi=100)
-        self._canvas = FigureCanvasAgg(figure)
-        self._word = figure.text(0.98, 0.36, '', fontsize=11.5, weight='bold', ha='right')
-        for x, (part, colour) in zip((0.43, 0.5, 0.58), PART_COLOURS.items(), strict=True):
-            figure.text(x, 0.445, part, color=colour, fontsize=11, ha='center')
-        axes = figure.add_axes((0.085, 0.105, 0.895, 0.235))
-        self._t, self._status = PERIOD_S * np.arange(films.samples), films.learned.status
-        reach = 1.15 * max(float(np.abs(_error(run)).max()) for run in films[:2])
-        axes.axhline(0.0, color='0.7', linewidth=0.8)
-        axes.set(xlim=(0.0, self._t[-1]), ylim=(-reach, reach), xlabel='time [s]',
-                 yticks=(-0.4, 0.0, 0.4))
-        axes.set_ylabel('load − reference [°]', y=0.35)
-        self._parts: list[tuple[Run, View, Any, Any]] = []  # with the text and the curve of each
-        for run, left, colour, name in (
-            (films.without, 0.0, WITHOUT_COLOUR, 'without compensation'),
-            (films.learned, 0.5, WITH_COLOUR, 'with backlash_ros'),
-        ):
-            figure.text(left + 0.25, 0.945, name, color=colour, fontsize=15, ha='center',
-                        weight='bold')
-            self._parts.append((run, View(figure.add_axes((left, 0.4, 0.5, 0.53))),
-                                figure.text(left + 0.05, 0.36, '', color=colour, fontsize=11.5),
-                                axes.plot([], [], color=colour, linewidth=1.8)[0]))
-
-    def draw(self, k: int) -> Image.Image:
-        """The picture at sample k, with the errors over the last period, or as much as there is."""
-        begin = max(k - round(SINE_S / PERIOD_S), 0)
-        for run, view, text, curve in self._parts:
-            for part, angles in (('motor', run.motor), ('load', run.y), ('reference', run.y_m)):
-                view.turn(part, angles[k])
-            error = _error(run)
-            rms = np.sqrt(np.mean(error[begin:k + 1]**2))
-            text.set_text(f'RMS error of the last {SINE_S:g} s: {rms:.3f}°')
-            curve.set_data(self._t[:k + 1], error[:k + 1])
-        self._word.set_text(Status(self._status[k]).word)
-        self._canvas.draw()
-        return Image.fromarray(np.asarray(self._canvas.buffer_rgba())).convert('RGB')
-
-
-def _error(run: Run) -> Array:
-    return np.degrees(run.y - run.y_m)
+    def turn(self, *angles: float) -> None:
+        """Show motor, load and reference at angles [rad], clockwise."""
+        for patches, angle in zip(self._parts, angles, strict=True):
+            for patch in patches:
+                patch.set_transform(Affine2D().rotate(-MAGNIFIED * angle) + self._axes.transData)
 
 
 def main() -> None:
-    films = run_loops()
-    frames = Frames(films)
-    pictures = [frames.draw(k) for k in range(0, films.samples, round(FRAME_S / PERIOD_S))]
+    """Identify the servo, close the loop with a gap of 0, for good and to begin with, and draw."""
+    parameters = identified(GEAR, encoder=False).parameters
+    assert parameters is not None
+    unknown = parameters.replaced({'estimator.initial.c_r': 0.0, 'estimator.initial.c_l': 0.0})
+    without = constant(parameters, parameters.estimator.initial.m, 0.0, 0.0)
+    runs = [close_loop(GEAR, controller, 'sine', periods=PERIODS + 1)
+            for controller in (without, build_controller(unknown))]
+    # Until the reference, which is followed late, is where it began.
+    t = PERIOD_S * np.arange(round(PERIODS * SINE_S / PERIOD_S) + without.structure.delay)
+    errors = [np.degrees(run.y - run.y_m) for run in runs]
+
+    figure = Figure((8.0, 5.2), dpi=100)
+    canvas = FigureCanvasAgg(figure)
+    word = figure.text(0.98, 0.36, '', fontsize=11.5, weight='bold', ha='right')
+    for x, part, colour in ((0.43, 'motor', MOTOR), (0.5, 'load', LOAD),
+                            (0.58, 'reference', REFERENCE)):
+        figure.text(x, 0.445, part, color=colour, fontsize=11, ha='center')
+    axes, reach = figure.add_axes((0.085, 0.105, 0.895, 0.235)), 1.15 * np.abs(errors).max()
+    axes.axhline(0.0, color='0.7', linewidth=0.8)
+    axes.set(xlim=(0.0, t[-1]), ylim=(-reach, reach), xlabel='time [s]', yticks=(-0.4, 0.0, 0.4))
+    axes.set_ylabel('load − reference [°]', y=0.35)
+    views, texts, curves = [], [], []
+    for left, colour, name in SIDES:
+        figure.text(left + 0.25, 0.945, name, color=colour, fontsize=15, ha='center', weight='bold')
+        views.append(View(figure.add_axes((left, 0.4, 0.5, 0.53))))
+        texts.append(figure.text(left + 0.05, 0.36, '', color=colour, fontsize=11.5))
+        curves += axes.plot([], [], color=colour, linewidth=1.8)
+    pictures = []
+    for k in range(0, len(t), round(FRAME_S / PERIOD_S)):
+        for run, error, view, text, curve in zip(runs, errors, views, texts, curves, strict=True):
+            view.turn(run.motor[k], run.y[k], run.y_m[k])
+            lately = error[max(k - round(SINE_S / PERIOD_S), 0):k + 1]
+            rms = np.sqrt(np.mean(lately**2))
+            text.set_text(f'RMS error of the last {SINE_S:g} s: {rms:.3f}°')
+            curve.set_data(t[:k + 1], error[:k + 1])
+        word.set_text(Status(runs[1].status[k]).word)
+        canvas.draw()
+        pictures.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert('RGB'))
     sample = np.hstack([np.asarray(one) for one in pictures[::len(pictures) // 8]])
     palette = Image.fromarray(sample).quantize(48, Image.Quantize.MAXCOVERAGE)
     save_film(ROOT / 'docs' / 'images' / 'gear.gif', pictures, palette, FRAME_S, 2.0)

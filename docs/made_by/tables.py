@@ -1,22 +1,98 @@
-"""The tables with numbers that `make docs` writes into the pages."""
+"""The runs and the tables with numbers that `make docs` writes, and the page of parameters."""
 
 import re
-from collections.abc import Callable
-from itertools import product
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 
 import combinations_of_laws
 import numpy as np
 import printed_law
 from reporting import ROOT
 from reporting import markdown_table as markdown
-from runs import simulate
 
 from backlash_ros.core.assembly import build_model, build_true_model
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.parameters.parameter import Parameter, as_yaml
+from backlash_ros.core.parameters.table import BY_NAME
 from backlash_ros.core.plant.transfer_function import TransferFunction
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.metrics import control_error_rms, settling_time
 from backlash_ros.core.simulation.run_record import RunRecord
+from backlash_ros.tools.config import effective_parameters
+from backlash_ros.tools.runs.read_run import run_loop
+
+# No compensation: the inverse is told that there is no gap, and learns nothing.
+WITHOUT = {'estimator.law': 'fixed', 'estimator.initial.c_r': '0.0', 'estimator.initial.c_l': '0.0'}
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run: what `simulate --config CONFIG --set ... --duration SECONDS` computes."""
+
+    parameters: Parameters
+    record: RunRecord
+    delay: int  # samples by which y is meant to follow y_m
+    model: TransferFunction  # G at the end: the learned one where one is in use
+
+
+def simulate(
+    duration: float, settings: Mapping[str, str] | None = None, config: str | None = None,
+) -> Run:
+    """Run once, or take the run that has been made already."""
+    return _simulate(duration, tuple((settings or {}).items()), config)
+
+
+@cache
+def _simulate(duration: float, settings: tuple[tuple[str, str], ...], config: str | None) -> Run:
+    parameters = effective_parameters(
+        Path(config) if config else None, [f'{name}={value}' for name, value in settings])
+    loop = build_closed_loop(parameters)
+    record = run_loop(loop, round(duration / parameters.sample_period))
+    learned = loop.controller.redesign.adopted
+    model = build_model(parameters) if learned is None else learned.transfer_function
+    return Run(parameters, record, loop.controller.structure.delay, model)
+
+
+PAGE = Path(__file__).resolve().parents[1] / 'reference' / 'parameters.md'
+HEAD = """# Parameters
+
+Made from [table.py](../../backlash_ros/core/parameters/table.py) by `make docs`; do not edit.
+The nodes, `bringup` and `simulate` all read one YAML file:
+[paper_example.yaml](../../config/paper_example.yaml) shows every group.
+`y`, `y_m`, `u` and `v` stand for the units of those signals. Parameters marked *live* may change in
+a running node; all others of `controller`, but for those marked *fixed*, while it is unconfigured.
+
+| name | default | unit | allowed | meaning | used by |
+|---|---|---|---|---|---|
+"""
+
+
+def parameters_page() -> str:
+    return HEAD + ''.join(f'{_row(parameter)}\n' for parameter in BY_NAME.values())
+
+
+def _row(p: Parameter) -> str:
+    users = ', '.join([*p.used_by, *{'live': ['*live*'], 'never': ['*fixed*']}.get(p.change, [])])
+    cells = (f'`{p.name}`', f'`{as_yaml(p.default)}`', p.unit, _allowed(p), p.description, users)
+    return '| ' + ' | '.join(cell.replace('|', '\\|') for cell in cells) + ' |'
+
+
+def _allowed(p: Parameter) -> str:
+    if p.choices:
+        return ', '.join(f'`{choice}`' for choice in p.choices)
+    if isinstance(p.default, bool):
+        return '`true`, `false`'
+    return ', '.join(filter(None, (p.rules, f'{p.length} numbers' if p.length else '')))
+
+
+def write_parameters() -> None:
+    PAGE.write_text(parameters_page(), encoding='utf-8')
+
+
+
 
 NAMES = ('m', 'c_r', 'c_l')
 SECONDS = 10.0
@@ -72,13 +148,6 @@ def laws() -> str:
     )
 
 
-def printed_moves() -> str:
-    """Consequence 1 of the printed law."""
-    return markdown(('mean change of', 'newest values', 'all values old'), [
-        (name, f'{new:.1g}', f'{old:.2g}')
-        for name, (new, old) in printed_law.moves_after_the_first().items()])
-
-
 def printed_not_finite() -> str:
     """Consequence 2 of the printed law."""
     sample, name = printed_law.first_not_finite()
@@ -91,18 +160,6 @@ def printed_growth() -> str:
     return markdown(('f', 'measured e(t+1) / e(t)', 'm / f'), [
         (f'{f:g}', f'{printed_law.error_growth(f):.4f}', f'{1.3 / f:.4f}')
         for f in (0.22, 0.5, 1.0)])
-
-
-def printed_readings() -> str:
-    """Where a dozen readings of the printed law end."""
-    rows = []
-    for newest, learns_f, relaxation in product((True, False), (True, False), (1.0, 0.1, 0.01)):
-        e = printed_law.last_estimate(
-            printed_law.Reading(newest, relaxation, learns_f), SECONDS)
-        rows.append(('newest' if newest else 'old', 'learned' if learns_f else 'kept',
-                     f'{relaxation:g}', f'{e.m:.3g}', f'{e.c_r:.3g}', f'{e.c_l:.3g}'))
-    return markdown(('values used', 'f', 'step', 'm', 'c_r', 'c_l'),
-                    [('truth', '', '', '1.3', '3', '-3'), *rows])
 
 
 def disturbance() -> str:
@@ -170,5 +227,5 @@ def combinations() -> str:
 
 
 TABLES: dict[str, Callable[[], str]] = {table.__name__: table for table in (
-    plant_facts, laws, printed_moves, printed_not_finite, printed_growth, printed_readings,
+    plant_facts, laws, printed_not_finite, printed_growth,
     disturbance, uncertain_plants, combinations, estimator_constants)}

@@ -6,7 +6,7 @@ from math import sin
 import numpy as np
 import pytest
 from cases.loops import motor
-from contract.judged import judged
+from contract.figures import judged
 from contract.learning_rows import PAPER as EXACT
 from contract.learning_rows import Job, Outcome, changes_jobs, run_job
 from ordinary_motions import all_cases, run_case

@@ -11,8 +11,8 @@ from xml.etree import ElementTree
 import accuracy
 import pytest
 import yaml
-from generate_parameters import parameters_page
 from places import ROOT
+from tables import parameters_page
 
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_controller

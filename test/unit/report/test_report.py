@@ -134,7 +134,7 @@ def other_bag(path: Path, run: RunRecord) -> None:
     (lambda path, run: write_bag(path, RunRecord(run.rows[:0], run.sample_period)),
      'holds no message of controller/signals'),
     (lambda path, run: path.mkdir(), 'holds no bag, no record.npz and no samples.csv'),
-    (lambda path, run: path.touch(), 'is neither a bag'),
+    (lambda path, run: path.touch(), 'holds no table: give rows of numbers'),
 ])
 def test_unusable_input_is_one_line_and_leaves_nothing(
     run: RunRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,

@@ -1,1 +1,0 @@
-"""Cases and runs behind the accuracy of estimation and identification."""

@@ -1,1 +1,0 @@
-"""The loop that faults.py plays, in one process."""

@@ -1,1 +1,0 @@
-"""Gears made of physics: their runs in one process."""
