@@ -8,13 +8,13 @@ from contextlib import closing
 from pathlib import Path
 
 import numpy as np
+from real_time.measuring import DEADLINE_S, MeasuringNode, node_command, processes, wait_for_event
 from reporting import Check, Measured
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_plant
 from backlash_ros.core.parameters import Parameters
-from real_time.measuring import DEADLINE_S, MeasuringNode, node_command, processes, wait_for_event
 
 COST_HEADER = ('rate', 'process', 'processor [%]', 'per sample [us]', '/ echo', 'memory [MB]')
 COST_RATES_HZ = (100.0, 200.0)
