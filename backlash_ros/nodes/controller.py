@@ -365,7 +365,8 @@ class ControllerNode(ManagedNode):
             return
         self._io.serve_waiting()
         for joint in self.joints:
-            joint.save_now_and_then()
+            if 0.0 < joint.p.estimates.save_period < time.monotonic() - joint.saved_at:
+                joint.save()
         if loops.give_up_silent():
             if self._ending is None:
                 self._ending = self.create_timer(

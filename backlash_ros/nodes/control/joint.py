@@ -37,7 +37,7 @@ class Joint:
 
     p: its parameters. loop: None while the node is unconfigured. v: the command that acts as far as
     this node can know, None if it cannot. told: what /diagnostics has, None where it is to be told
-    anew.
+    anew. saved_at: when estimates were saved last, on the steady clock [s].
     """
 
     def __init__(self, node: ProcessNode, name: str, p: Parameters, io: DriverIo) -> None:
@@ -55,7 +55,7 @@ class Joint:
         )
         # A disk that is slow to confirm a file would cost samples; one writing follows the other.
         self._writer = ThreadPoolExecutor(1, thread_name_prefix='estimates')
-        self._saved_at = time.monotonic()
+        self.saved_at = time.monotonic()
 
     @property
     def driver(self) -> Driver:
@@ -121,7 +121,7 @@ class Joint:
         """
         if self.loop is None or not self.p.estimates.file or not worth_saving(self.loop.estimate):
             return None
-        self._saved_at = time.monotonic()
+        self.saved_at = time.monotonic()
         return self._writer.submit(self._write, self.loop.estimate, self.p)
 
     def _write(self, estimate: Estimate, p: Parameters) -> str:
@@ -132,11 +132,6 @@ class Joint:
             self._node.log.error(text)
             return text
         return ''
-
-    def save_now_and_then(self) -> None:
-        """Begin to save as often as estimates.save_period says; never with 0."""
-        if 0.0 < self.p.estimates.save_period < time.monotonic() - self._saved_at:
-            self.save()
 
     def diagnose(
         self, around: Neighbours, timing: Timing, claim: Mapping[str, object], active: bool,
