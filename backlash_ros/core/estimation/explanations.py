@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import sqrt
 from typing import NamedTuple
@@ -233,30 +234,31 @@ def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]
     weights, std, v = p.at(best).weights, sqrt(best.cov[2, 2]), float(p.v[0])
     likeliest, widest = p.log_posterior(best, weights), 2.0 * float(np.ptp(p.v))
     for away in (-3.0, 3.0):
-        wider, there, behind = np.zeros((3, 3)), best, 0.0
-        for reach in away * 3.0 ** np.arange(6.0):
-            gap = best.gap + reach * std
-            if not 0.0 < gap < widest:
-                break
-            there = replace(
-                best, p0=v + (best.p0 - v) * gap / best.gap,
-                theta=best.theta + best.cov[:, 2] * reach / std,
-            )
-            try:
+        wider, nearer, beside = np.zeros((3, 3)), 0.0, None
+        with suppress(np.linalg.LinAlgError):  # so far away that y is no number
+            for reach in away * 3.0 ** np.arange(6.0):
+                gap = best.gap + reach * std
+                if not 0.0 < gap < widest:
+                    break
+                there = replace(
+                    best, p0=v + (best.p0 - v) * gap / best.gap,
+                    theta=best.theta + best.cov[:, 2] * reach / std,
+                )
                 for _ in range(FEW_STEPS):
                     there = p.kept(p.step(there, held=True))
-            except np.linalg.LinAlgError:  # so far away that y is no number
-                there = best
-                break
-            nearer, behind = behind, max(likeliest - p.log_posterior(there, weights), 1.0)
-            if nearer <= 2.0:
-                apart = there.crossings - best.crossings
-                wider = max(0.5 / behind - reach**-2, 0.0) * np.outer(apart, apart)
-            if (behind > 2.0 and nearer) or there.m <= 0.0:
-                break
+                behind = max(likeliest - p.log_posterior(there, weights), 1.0)
+                if nearer <= 2.0:
+                    apart = there.crossings - best.crossings
+                    wider = max(0.5 / behind - reach**-2, 0.0) * np.outer(apart, apart)
+                if not there.m > 0.0:
+                    break
+                beside = there if behind < 0.25 * reach**2 else None
+                if nearer and behind > 2.0:
+                    break
+                nearer = behind
+            if beside is not None:
+                beyond.append(p.finished(p.fitted(beside)))
         out += 0.5 * wider
-        if there is not best and there.m > 0.0 and behind < 0.25 * reach**2:
-            beyond.append(p.finished(p.fitted(there)))
     return out, beyond
 
 

@@ -109,7 +109,7 @@ def _searching(setup: Setup, record: Window, before: Belief) -> Belief:
                     found=None, reason=why, coasts=False)
     if found is None:
         return after
-    found, swapped = _with_commands(setup, part, found, before.kept.swapped)
+    part, found, swapped = _with_commands(setup, part, found, before.kept.swapped)
     runs_on = _runs_on(
         problem_of(setup, part), found, before.published and before.published.crossings)
     after = replace(
@@ -132,21 +132,19 @@ def _searching(setup: Setup, record: Window, before: Belief) -> Belief:
 
 def _with_commands(
     setup: Setup, record: Window, found: WindowFit, swapped: frozenset[int],
-) -> tuple[WindowFit, frozenset[int]]:
-    """The fit and the commands that go with each other, found in turn.
+) -> tuple[Window, WindowFit, frozenset[int]]:
+    """The record, the fit and the commands that go with each other, found in turn.
 
     Commands that leave more than noise explain nothing: those that were sent stay.
     """
-    if not np.isfinite(record.other).any():
-        return found, swapped
-    fit, others = found, swapped
-    for _ in range(4):
-        before = others
-        record, others = likelier(problem_of(setup, record), fit, record, record.first, before)
-        if others == before:
+    sent = record, found, swapped
+    for _ in range(4 if np.isfinite(record.other).any() else 0):
+        before = swapped
+        record, swapped = likelier(problem_of(setup, record), found, record, record.first, before)
+        if swapped == before:
             break
-        fit = afresh(setup, record, also=fit) or fit
-    return (found, swapped) if _leaves_more(setup, fit) else (fit, others)
+        found = afresh(setup, record, also=found) or found
+    return sent if _leaves_more(setup, found) else (record, found, swapped)
 
 
 def _why(setup: Setup, found: WindowFit | None, record: Window, before: Belief) -> Status:
