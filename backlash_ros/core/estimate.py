@@ -23,11 +23,6 @@ class Status(IntEnum):
         """Its name as people write it."""
         return self.name.lower().replace('_', ' ')
 
-    @property
-    def frozen(self) -> bool:
-        """Whether the last good estimate is held."""
-        return self >= Status.NOT_EXCITED
-
 
 @dataclass(frozen=True)
 class Estimate:

@@ -148,11 +148,6 @@ class Law:
     # --- now and then ---------------------------------------------------------------------------
 
     @property
-    def covariance(self) -> Array | None:
-        """Covariance of (m, c_r, c_l) behind the deviations, shape (3, 3); None without one."""
-        return None
-
-    @property
     def report(self) -> LawReport:
         """How its work goes."""
         return LawReport()

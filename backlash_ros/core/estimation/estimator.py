@@ -121,11 +121,6 @@ class MovingHorizon(Law):
         return self._following.model
 
     @property
-    def covariance(self) -> Array | None:
-        published = self._belief.published
-        return None if published is None else published.cov
-
-    @property
     def u_hat(self) -> float:
         return self._following.u
 
