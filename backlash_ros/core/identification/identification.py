@@ -88,14 +88,12 @@ def identify(
         s = later(s, options, progress)
     progress('choosing the delay')
     best, rows = s.best, effective(s.best.left)
-    others = [
-        fitted(s.samples, structure, moved_to(structure, best)) for structure in (
-            replace(best.structure, delay=delay) for delay in equal_delays(s.compared, s.chosen))
-    ]
+    structures = [replace(best.structure, delay=delay)
+                  for delay in equal_delays(s.compared, s.chosen) if delay != best.structure.delay]
+    others = [fitted(s.samples, one, moved_to(one, best)) for one in structures]
     # With as many poles, some of them may fit worse.
-    best = least_response(best, [
-        one for one in others if one.structure != best.structure and rows * log(
-            max(one.squares, TINY) / max(best.squares, TINY)) <= PLATEAU])
+    best = least_response(best, [one for one in others if rows * log(
+        max(one.squares, TINY) / max(best.squares, TINY)) <= PLATEAU])
     samples = s.samples
     if len(v) > len(samples.v):
         progress('fitting the whole record')
