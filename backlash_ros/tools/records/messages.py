@@ -18,7 +18,7 @@ from backlash_ros.core.records.record import Record, RecordError
 from backlash_ros.core.records.rows_to_record import readings, usable
 from backlash_ros.core.records.stamps import in_order
 from backlash_ros.core.records.timing import Rows, on_grid
-from backlash_ros.tools.runs.bag import choose_namespace, read_topics
+from backlash_ros.tools.runs.bag import choose_namespace, read_topics, topic_ends_like
 
 Messages = tuple[NDArray[np.int64], NDArray[np.float64]]  # stamps [ns] and values
 
@@ -45,7 +45,7 @@ def read_bag_record(
     simulated_before_ns = 10**17  # stamps: the clock of a machine is far beyond
     signals, damage = _signals(path)
     of_joints = any(each.joint or each.commanded for each in signals.values())
-    native = any(f'/{name}'.endswith(f'/{topics.PLANT_OUTPUT}') for name in signals)
+    native = any(topic_ends_like(name, topics.PLANT_OUTPUT) for name in signals)
     if columns or (of_joints and not native):
         v, y = _joint_pair(signals, axis, columns)
         heard = {topics.CONTROL: signals[v].messages, topics.PLANT_OUTPUT: signals[y].messages}
@@ -113,7 +113,7 @@ def _native(signals: Mapping[str, Signal], axis: str) -> tuple[dict[str, Message
     chosen: dict[str, Messages] = {}
     about = ''
     for topic in (topics.PLANT_OUTPUT, topics.CONTROL, topics.APPLIED_CONTROL):
-        ends = sorted(name for name in signals if f'/{name}'.endswith(f'/{topic}'))
+        ends = sorted(name for name in signals if topic_ends_like(name, topic))
         name, note = choose_namespace(ends, axis)
         if name:
             chosen[topic] = signals[name].messages
