@@ -22,16 +22,13 @@ from typing import Any, NamedTuple
 
 # Before numpy is imported: the matrices are tiny, threads would only disturb the processes.
 os.environ.setdefault('OMP_NUM_THREADS', '1')
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import faults
 import ordinary_motions
 from contract import following_rows, learning_rows, situation_rows, timing_rows
 from contract.figures import COMPARED_HEADER, Figure, Row, as_json, compare, show
-from reporting import ROOT, machine, markdown_table, parser_of
+from reporting import ROOT, format_table, machine, markdown_table, parser_of
 from tqdm import tqdm
-
-from backlash_ros.tools.cli import format_table
 
 REFERENCE = ROOT / 'benchmarks' / 'reference_accuracy.json'
 PAGE = ROOT / 'docs' / 'results' / 'accuracy.md'
@@ -91,12 +88,6 @@ def measure(name: str, scale: float, workers: int) -> Row:
         pool.close()
         pool.join()  # so that their processor time counts
     return row.figures(found)
-
-
-def _processor_s() -> float:
-    """Of this process and those that have ended."""
-    times = os.times()
-    return times.user + times.system + times.children_user + times.children_system
 
 
 def _prepare() -> None:
@@ -162,11 +153,11 @@ def main() -> int:
     before = read_rows(REFERENCE)
     rows: dict[str, Row] = {}
     for name in filter(arguments.only.__contains__, ROWS):
-        begun, used = time.monotonic(), _processor_s()
+        begun, used = time.monotonic(), sum(os.times()[:4])
         rows[name] = row = measure(name, arguments.scale, arguments.workers)
         # Shown, and kept, as soon as it is known: all of them take minutes.
         print(f'\n{name} ({time.monotonic() - begun:.0f} s, of processors '
-              f'{_processor_s() - used:.0f} s)')
+              f'{sum(os.times()[:4]) - used:.0f} s)')
         known = before.get(name, {})
         print(format_table(('figure', 'now', 'reference'), [
             [what, show(one), show(known[what]) if what in known else '–']

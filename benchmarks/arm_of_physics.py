@@ -20,9 +20,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
-from reporting import ROOT, Array, parser_of, save_film
-
-from backlash_ros.tools.cli import format_table
+from reporting import ROOT, Array, format_table, parser_of, save_film
 
 sys.path.append(str(ROOT / 'examples'))
 os.environ.setdefault('MUJOCO_GL', 'osmesa')  # mujoco reads it when it is imported

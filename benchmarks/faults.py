@@ -19,14 +19,11 @@ from typing import NamedTuple
 
 # Before numpy is imported: the matrices are tiny, threads would only disturb the processes.
 os.environ.setdefault('OMP_NUM_THREADS', '1')
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 sys.path.insert(1, str(Path(__file__).resolve().parents[1]))
 
 from fault_loop.fault_sequences import KINDS, Sequence
 from fault_loop.fault_world import PERIOD_S
-from reporting import ROOT, markdown_table, parser_of, processors, write_between
-
-from backlash_ros.tools.cli import format_table
+from reporting import ROOT, format_table, markdown_table, parser_of, processors, write_between
 
 DOCUMENT = ROOT / 'docs' / 'faults.md'
 SEQUENCES, FIRST_SEED = 20_000, 1
@@ -42,12 +39,6 @@ class Result(NamedTuple):
     commands: int
     claimed: bool
     found: dict[str, str]
-
-
-def read_results(path: Path | None) -> list[Result]:
-    """What a file of results holds, a line of JSON each; nothing where there is none yet."""
-    lines = path.read_text().splitlines() if path and path.exists() else []
-    return [Result(*json.loads(line)) for line in lines]
 
 
 def play(seed: int) -> Result:
@@ -67,9 +58,7 @@ def play(seed: int) -> Result:
 def show(seed: int) -> int:
     for kind, texts in Sequence(seed, print).run().items():
         for text in texts[:SHOWN]:
-            print(f'{kind}: {text}')
-        if len(texts) > SHOWN:
-            print(f'{kind}: ... {len(texts)} in all')
+            print(f'{kind}, {len(texts)} in all: {text}')
     return 0
 
 
@@ -105,7 +94,9 @@ def main() -> int:
         return show(arguments.seed)
     first = arguments.first_seed
     wanted = range(first, first + arguments.sequences)
-    results = [result for result in read_results(arguments.results) if result.seed in wanted]
+    path = arguments.results
+    lines = path.read_text().splitlines() if path and path.exists() else []
+    results = [one for one in (Result(*json.loads(line)) for line in lines) if one.seed in wanted]
     known = {result.seed for result in results}
     target = arguments.results.open('a', encoding='utf-8') if arguments.results else nullcontext()
     with Pool(arguments.processes) as pool, target as file:

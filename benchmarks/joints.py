@@ -22,13 +22,12 @@ import psutil
 from builtin_interfaces.msg import Time
 from real_time.costs import processor_s, resident_mb
 from real_time.measuring import MeasuringNode, node_command, processes, wait_for_event
-from reporting import parser_of
+from reporting import format_table, parser_of
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, Header
 
 from backlash_ros.core.assembly import build_plant
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.tools.cli import format_table
 
 JOINTS = tuple(f'joint_{i}' for i in range(1, 7))
 WARM_UP_S = 6.0  # acquisition is not counted

@@ -22,10 +22,9 @@ import numpy as np
 from cases.loops import NINE_DIGITS, load_model, loop_on, motor, random_backlash
 from contract.figures import FAR, Array, Figure, by_group, figure, judged, rms, share, upper
 from numpy.typing import NDArray
-from reporting import parallel, parser_of
+from reporting import format_table, parallel, parser_of
 
 from backlash_ros.core import Status
-from backlash_ros.tools.cli import format_table
 
 AMPLITUDE = 0.5  # of y_m [rad]
 FIVE_PERIODS = 10  # reversals
@@ -264,18 +263,16 @@ def run_case(case: Case) -> Result:
     offset = float(str(case.differs.get('input_disturbance', 0.0)))
     run = judged(record, offset / backlash['backlash.m'])
     reversals, omega = reversals_of(y_m), case.shape.omega
-    five = int(np.argmax(reversals >= FIVE_PERIODS)) or len(y_m) - 1
-    if omega:
-        five = min(round(5 * 2 * pi * case.rate / omega), len(y_m) - 1)
+    five = round(5 * 2 * pi * case.rate / omega) if omega \
+        else int(np.argmax(reversals >= FIVE_PERIODS)) or len(y_m)
+    five = min(five, len(y_m) - 1)
     std = float(run.std[five].max())
 
     def first(rows: NDArray[np.bool_]) -> int | None:
-        return int(np.argmax(rows)) if rows.any() else None
+        return int(reversals[np.argmax(rows)]) if rows.any() else None
 
-    learned, begun = first(run.tracking & (run.error <= FAR)), first(run.tracking)
     return Result(
-        *key, None if learned is None else int(reversals[learned]),
-        None if begun is None else int(reversals[begun]),
+        *key, first(run.tracking & (run.error <= FAR)), first(run.tracking),
         float(run.error[five]), std if np.isfinite(std) else None, run.rms, run.beyond,
         run.wrong_if_tracking,
         {word.word: float(np.mean(run.status == word)) for word in Status},

@@ -18,10 +18,17 @@ from gears import gear_runs
 from gears.gear_runs import MOTIONS, PRESETS, Identified
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from reporting import ROOT, machine, markdown_table, parallel, processors, write_between
+from reporting import (
+    ROOT,
+    format_table,
+    machine,
+    markdown_table,
+    parallel,
+    processors,
+    write_between,
+)
 
 from backlash_ros.core.estimate import Status
-from backlash_ros.tools.cli import format_table
 
 DOCUMENT = ROOT / 'docs' / 'physics.md'
 REMOVED, OFF = 0.9, 0.1  # bounds: share that is removed, error of the gap under *tracking*
@@ -97,11 +104,12 @@ FOUND_HEADER = ('preset', 'v from', 'gap', 'lost motion, measured', 'gap found /
 
 
 def found_row(one: Source) -> list[str]:
-    gear, found = PRESETS[one.preset], one.identified.found
-    said = f'{one.identified.said} {one.identified.option and f"({one.identified.option})"}'
+    gear, (found, option, _, refused) = PRESETS[one.preset], one.identified
+    said = f'refused: {refused}' if refused else '; '.join(found.reasons) or 'of use'
+    said += f' ({option})' if option else ''
     return [
         one.preset, FROM[one.encoder], f'{gear.scale * gear.gap:.4g}', f'{one.lost:.4g}',
-        f'{found.gap / one.lost:.3f} ± {found.std.get("gap", nan) / one.lost:.2g}', said.strip(),
+        f'{found.gap / one.lost:.3f} ± {found.std.get("gap", nan) / one.lost:.2g}', said,
     ]
 
 

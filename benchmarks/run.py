@@ -17,18 +17,13 @@ from cases.loops import motor
 from real_time.costs import COST_HEADER, measure_costs, soak_checks
 from real_time.loop_latency import BLOCK, LATENCY_HEADER, lockstep_speed, measure_latencies
 from real_time.step_times import LAWS, STEP_HEADER, measure_steps
-from reporting import CHECK_HEADER, ROOT, Check, Measured, machine, markdown_table
+from reporting import CHECK_HEADER, ROOT, Check, Measured, format_table, machine, markdown_table
 
 from backlash_ros.core import Parameters, build_closed_loop
-from backlash_ros.tools.cli import format_table
 
 DOCUMENT = ROOT / 'docs' / 'results' / 'performance.md'
 DURATION_S = 20.0
 ACQUIRED, SIMULATED_SAMPLES = 3000, 12000
-
-
-def measure_lockstep(_: float) -> Measured:
-    return [[law, f'{lockstep_speed(law):.0f}'] for law in ('moving_horizon', 'lms')], []
 
 
 def measure_simulation(_: float) -> Measured:
@@ -86,7 +81,8 @@ PARTS = {
         COST_HEADER, measure_costs),
     'lockstep': Part(
         'Lockstep', 'Plant, controller and reference as processes over DDS, as fast as they go.',
-        ('law', 'samples/s'), measure_lockstep),
+        ('law', 'samples/s'), lambda duration_s: (
+            [[law, f'{lockstep_speed(law):.0f}'] for law in ('moving_horizon', 'lms')], [])),
     'simulate': Part(
         'Simulation',
         'The loop in one process, on one processor. The search for the backlash and the first fits '

@@ -26,12 +26,11 @@ os.environ.setdefault('OMP_NUM_THREADS', '1')
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from fault_loop.fault_controller import blamed
 from real_time.measuring import DEADLINE_S, MeasuringNode, node_command, processes_in
-from reporting import CHECK_HEADER, ROOT, Check, machine, parser_of, processors
+from reporting import CHECK_HEADER, ROOT, Check, format_table, machine, parser_of, processors
 
 from backlash_ros import topics
 from backlash_ros.tools.bringup.environment import free_domain
 from backlash_ros.tools.bringup.supervisor import Child
-from backlash_ros.tools.cli import format_table
 
 BOUND_S, LONGEST_S = 3.0, 15.0  # in which a line is to be there, and that it is waited for
 SOUND_S = 3.0  # of the loop before a mistake that is made while it runs

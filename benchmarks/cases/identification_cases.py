@@ -30,13 +30,10 @@ class Case(NamedTuple):
     m: float
     gap: float
     c_r: float
+    c_l: float
     v: Array
     y: Array
     level: float  # of the noise [y]
-
-    @property
-    def c_l(self) -> float:
-        return self.c_r - self.gap
 
     def response(self, frequencies: Array) -> NDArray[np.complex128]:
         """m G with its delay, at frequencies [rad/sample]."""
@@ -66,7 +63,8 @@ def random_case(seed: int, series: int = 2026) -> Case:
     level = _geometric(rng, *NOISE) * float(np.ptp(moving))
     y = np.round(clean / level) * level if rng.random() < 0.5 \
         else clean + level * rng.standard_normal(count)
-    return Case(period, m * numerator, denominator, delay, integrating, m, gap, c_r, v, y, level)
+    return Case(period, m * numerator, denominator, delay, integrating, m, gap, c_r, c_r - gap,
+                v, y, level)
 
 
 def _geometric(rng: np.random.Generator, low: float, high: float) -> float:

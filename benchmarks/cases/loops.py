@@ -6,7 +6,6 @@ from math import pi
 from typing import Any
 
 import numpy as np
-import yaml
 from reporting import ROOT, Array
 from scipy.signal import cont2discrete, lfilter
 
@@ -14,19 +13,13 @@ from backlash_ros.core import Parameters, build_closed_loop
 from backlash_ros.core.reference.signal import ReferenceSignal
 from backlash_ros.core.simulation.closed_loop import ClosedLoop
 from backlash_ros.core.simulation.run_record import RunRecord
-from backlash_ros.tools.config import flattened
-
-
-def flat(sections: Mapping[str, Any]) -> dict[str, Any]:
-    """Parameters of all sections of a parameter file, by their flat names."""
-    return {name: value for section in sections.values()
-            for name, value in flattened(section['ros__parameters'])}
+from backlash_ros.tools.config import read_configuration
 
 
 @lru_cache
 def motor() -> dict[str, Any]:
     """Parameters of config/geared_motor.yaml and its simulated plant."""
-    return flat(yaml.safe_load((ROOT / 'config' / 'geared_motor.yaml').read_text()))
+    return read_configuration(ROOT / 'config' / 'geared_motor.yaml').given()
 
 
 def random_backlash(seed: int) -> dict[str, float]:

@@ -98,11 +98,10 @@ class Case(NamedTuple):
 
     parameters: Parameters
     samples: int
-    kind: str
 
 
-def random_plant(rng: np.random.Generator) -> tuple[Array, Array, str]:
-    """Numerator, denominator and a description of a stable or integrating G of order 1 to 5."""
+def random_plant(rng: np.random.Generator) -> tuple[Array, Array]:
+    """Numerator and denominator of a stable or integrating G of order 1 to 5."""
     order = int(rng.integers(1, 6))
     integrating = bool(rng.random() < 0.4)
     poles: list[complex] = [1.0] if integrating else []
@@ -115,9 +114,7 @@ def random_plant(rng: np.random.Generator) -> tuple[Array, Array, str]:
     zeros = [float(rng.choice([-1.0, 1.0]) * rng.uniform(1.15, 4.0)) if rng.random() < 0.4
              else float(rng.uniform(-0.9, 0.8)) for _ in range(int(rng.integers(0, order)))]
     numerator = np.atleast_1d(np.real(np.poly(zeros))) * 10.0 ** rng.uniform(-4.0, 0.0)
-    kind = f'order {order}{" integrating" if integrating else ""}'
-    kind += ' nmp' if any(abs(zero) > 1.0 for zero in zeros) else ''
-    return numerator, np.real(np.poly(poles)), kind
+    return numerator, np.real(np.poly(poles))
 
 
 def random_case(seed: int) -> Case:
@@ -154,7 +151,7 @@ def uncertain_case(seed: int) -> Case:
 def _without_noise(seed: int, below_corners: bool = False) -> Case:
     """below_corners: whether the reference is no faster than the slowest pole."""
     rng = np.random.default_rng([seed, 20])
-    numerator, denominator, kind = random_plant(rng)
+    numerator, denominator = random_plant(rng)
     m, c_r, c_l = (sign * float(np.exp(rng.uniform(np.log(low), np.log(high))))
                    for sign, low, high in ((1, 0.3, 3.0), (1, 0.2, 8.0), (-1, 0.2, 8.0)))
     factors = 10.0 ** rng.uniform(-1.0, 1.0, 3)
@@ -180,7 +177,7 @@ def _without_noise(seed: int, below_corners: bool = False) -> Case:
         'waveform': waveform, 'amplitude': amplitude, 'frequency': float(omega),
         'sample_period': period, 'seed': seed, 'plant.uncertainty': 0.0,
     })
-    return Case(parameters, PERIODS * samples_per_period, f'{kind} {waveform}')
+    return Case(parameters, PERIODS * samples_per_period)
 
 
 def _slowest(denominator: Array) -> float:

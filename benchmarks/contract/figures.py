@@ -157,10 +157,6 @@ class Judged:
     def tracking(self) -> NDArray[np.bool_]:
         return self.status == Status.TRACKING
 
-    def first_s(self) -> float:
-        """Time of the first *tracking* [s], inf for never."""
-        return float(self.t[np.argmax(self.tracking)]) if self.tracking.any() else np.inf
-
     @property
     def rms(self) -> float | None:
         """RMS of error over deviation while *tracking*, CAPPED; None where it never was."""

@@ -13,7 +13,7 @@ import numpy as np
 import yaml
 from cases.held_up import HeldUpProcesses
 from cases.identification_cases import NO_PLAYS, Case, random_case, without_play
-from cases.loops import flat, motor
+from cases.loops import motor
 from contract.figures import Array, Figure, by_group, figure, share, upper
 from faults import Result
 from gears import gear_runs
@@ -21,6 +21,7 @@ from gears.gear_runs import PRESETS, Gear, close_loop, gear_of
 
 from backlash_ros.core import Estimate, Parameters, Status, build_controller, fit_record
 from backlash_ros.core.plant.transfer_function import TransferFunction
+from backlash_ros.tools.config import read_configuration
 from backlash_ros.tools.identify.command import main as identify
 
 # Late commands: driver and controller held up by a busy machine, in simulated time.
@@ -79,15 +80,14 @@ def faults_figures(results: Sequence[Result]) -> dict[str, Figure]:
 
 
 # Identification.
-class Found(NamedTuple):
-    """What `identify` found: identified.json, and parameters of identified.yaml."""
-
-    json: Mapping[str, Any]
-    parameters: Parameters | None
+Found = tuple[Mapping[str, Any], Parameters | None]
 
 
 def identified(t: Array, v: Array, y: Array, given: Mapping[str, Any] | None = None) -> Found:
-    """Let `identify` read a CSV. given: parameters that it goes on from."""
+    """What `identify` makes of a CSV: identified.json, and parameters of identified.yaml.
+
+    given: parameters that it goes on from.
+    """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         np.savetxt(folder / 'record.csv', np.column_stack([t, v, y]), '%.12g', ',',
@@ -100,10 +100,10 @@ def identified(t: Array, v: Array, y: Array, given: Mapping[str, Any] | None = N
         said = io.StringIO()
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
             identify(arguments)
-        texts = {path.name: path.read_text() for path in folder.glob('identified.*')}
-    found = json.loads(texts.get('identified.json', '{"usable": false}'))
-    of_yaml = texts.get('identified.yaml')
-    return Found(found, None if of_yaml is None else Parameters(flat(yaml.safe_load(of_yaml))))
+        results = {path.suffix: path for path in folder.glob('identified.*')}
+        found = json.loads(results['.json'].read_text()) if results else {'usable': False}
+        p = Parameters(read_configuration(results['.yaml']).given()) if '.yaml' in results else None
+    return found, p
 
 
 class Identified(NamedTuple):
@@ -134,7 +134,7 @@ def identification_jobs(scale: float) -> list[tuple[str, int]]:
 def run_identification(job: tuple[str, int]) -> Identified:
     group, seed = job
     if group == NONE:
-        found = identified(*without_play(NO_PLAYS[seed % len(NO_PLAYS)], seed)).json
+        found = identified(*without_play(NO_PLAYS[seed % len(NO_PLAYS)], seed))[0]
         known = (found.get('known') or {}).get('backlash', {}).get('known', False)
         return Identified(group, bool(known and found['gap'] > 3.0 * found['std']['gap']), 0.0, 0.0,
                           False)
@@ -152,7 +152,7 @@ def run_identification(job: tuple[str, int]) -> Identified:
         t = t + JITTER * case.period * rng.uniform(-1.0, 1.0, len(t))
     else:
         truth |= {'c_r': case.c_r, 'c_l': case.c_l}
-    found = identified(t, v, y).json
+    found, _ = identified(t, v, y)
     off = {name: abs(found[name] - true) if isinstance(found.get(name), float) else 1e3
            for name, true in truth.items()}
     std = (found.get('std') or {}).get('gap') or 1e-12
@@ -233,14 +233,14 @@ def run_gears(job: str | tuple[float, float]) -> list[GearOutcome]:
 
 
 def _closed(gear: Gear, group: str, motion: str, found: Found, lost: float) -> GearOutcome:
-    off, p = abs(float(found.json.get('gap') or 0.0) / lost - 1.0), found.parameters
-    usable = bool(found.json['usable'])
+    json_file, p = found
+    usable, off = bool(json_file['usable']), abs(float(json_file.get('gap') or 0.0) / lost - 1.0)
     if p is None:
         return GearOutcome(group, usable, off, None, None, 0.0, False)
-    std, initial = found.json['std'], p.estimator.initial
+    std, initial = json_file['std'], p.estimator.initial
     estimate = Estimate(
         initial.m, initial.c_r, initial.c_l, p.proportional.f,
-        *(max(std[name], 1e-6 * abs(found.json['gap'])) for name in ('m', 'c_r', 'c_l')))
+        *(max(std[name], 1e-6 * abs(json_file['gap'])) for name in ('m', 'c_r', 'c_l')))
     try:
         run = close_loop(gear, build_controller(p, estimate), motion)
     except (ArithmeticError, ValueError):

@@ -25,7 +25,7 @@ def parameters_of(rng: np.random.Generator) -> tuple[Parameters, float]:
     """Parameters of a loop, and the swing of its y."""
     law = str(rng.choice(LAWS))
     structure = str(rng.choice([name for name in STRUCTURES if law_fits(law, name)]))
-    numerator, denominator, _ = random_plant(rng)
+    numerator, denominator = random_plant(rng)
     m = float(np.exp(rng.uniform(np.log(0.3), np.log(3.0))))
     c_r, c_l = (float(np.exp(rng.uniform(np.log(0.2), np.log(8.0)))) for _ in range(2))
     gap = c_r + c_l

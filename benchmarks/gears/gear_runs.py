@@ -137,11 +137,6 @@ class Identified(NamedTuple):
     refused: str = ''
 
     @property
-    def said(self) -> str:
-        return f'refused: {self.refused}' if self.refused \
-            else '; '.join(self.found.reasons) or 'of use'
-
-    @property
     def controller(self) -> AdaptiveController:
         assert self.parameters is not None
         return build_controller(self.parameters, as_estimate(self.found, self.parameters))

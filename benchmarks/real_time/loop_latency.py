@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 from rclpy.publisher import Publisher
+from real_time import measuring
+from real_time.measuring import DEADLINE_S, MeasuringNode, node_command, processes, wait_for_event
 from reporting import Check, Measured
 from std_msgs.msg import Float64
 
@@ -18,8 +20,6 @@ from backlash_ros import topics
 from backlash_ros.core.assembly import build_plant, build_reference
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import BY_NAME, CONTROLLER
-from real_time import measuring
-from real_time.measuring import DEADLINE_S, MeasuringNode, node_command, processes, wait_for_event
 
 RATES_HZ = (100.0, 1000.0)
 LOOPS = (('moving_horizon', 'proportional'), ('moving_horizon', 'tracking'),
@@ -73,10 +73,9 @@ class Driver(MeasuringNode):
     def _on_echo(self, message: Float64) -> None:
         self._answered_at = time.perf_counter()
 
-    def connect(self) -> None:
-        """Return once everybody is heard and the controller has a reference."""
-        self.wait_for(lambda: all(p.get_subscription_count() for p in self._asked) and all(
-            s.get_publisher_count() for s in self._answers), DEADLINE_S, 'the nodes')
+    def connected(self) -> bool:
+        return all(p.get_subscription_count() for p in self._asked) and all(
+            s.get_publisher_count() for s in self._answers)
 
     def _ask(self, publisher: Publisher, value: float) -> float | None:
         message = Float64(data=value)
@@ -141,7 +140,7 @@ def measure_latency(
     }
     with processes(commands) as (supervisor, domain):
         with closing(Driver(domain, parameters)) as driver:
-            driver.connect()
+            driver.wait_for(driver.connected, DEADLINE_S, 'the nodes')
             result = driver.measure(duration_s)
         measuring.check_running(supervisor)
     if not (result.controller and result.echo):

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from PIL.Image import Dither, Image
 from tqdm import tqdm
 
+from backlash_ros.tools.cli import format_table as format_table
+
 Item = TypeVar('Item')
 Result = TypeVar('Result')
 

@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from reporting import write_between
-from tables import TABLES, WITHOUT, simulate, write_parameters
+from tables import TABLES, WITHOUT, parameters_page, simulate
 
 from backlash_ros.core.simulation.metrics import delayed_reference
 from backlash_ros.core.simulation.run_record import RunRecord
@@ -49,19 +49,14 @@ def draw_result() -> Figure:
     curve(upper, t, learned.column('y'), WITH_COLOUR, 'y with this package', width=1.8)
     label(upper, 'Load behind a worn gear', 'angle [rad]')
     drawn.legend_above(upper)
-    _draw_shares(lower, learned)
+    lower.axhline(1.0, label='truth', **RESTING)
+    for name, width in zip(NAMES, (1.4, 2.4, 1.6), strict=True):
+        share = learned.column(name) / learned.column(f'true_{name}')
+        curve(lower, t, share, HUES[name], f'${HATS[name]}$', drawn.LINE_STYLES[name], width)
     label(lower, 'What is learned from v and y', 'estimate / truth', TIME_LABEL)
     lower.set_ylim(-0.05, 1.15)
     drawn.legend_above(lower)
     return figure
-
-
-def _draw_shares(axes: Axes, run: RunRecord) -> None:
-    t = run.column('t')
-    axes.axhline(1.0, label='truth', **RESTING)
-    for name, width in zip(NAMES, (1.4, 2.4, 1.6), strict=True):
-        share = run.column(name) / run.column(f'true_{name}')
-        curve(axes, t, share, HUES[name], f'${HATS[name]}$', drawn.LINE_STYLES[name], width)
 
 
 def draw_figure_4() -> Figure:
@@ -187,7 +182,7 @@ def main() -> None:
     IMAGES.mkdir(exist_ok=True)
     for name, draw in FIGURES.items():
         (IMAGES / f'{name}.png').write_bytes(drawn.png(draw()))
-    write_parameters()
+    (DOCS / 'reference' / 'parameters.md').write_text(parameters_page())
     for page in PAGES:
         for name, table in TABLES.items():
             if f'<!-- {name}: made by docs/made_by/figures.py -->' in page.read_text():

@@ -56,7 +56,6 @@ def _simulate(duration: float, settings: tuple[tuple[str, str], ...], config: st
     return Run(parameters, record, loop.controller.structure.delay, model)
 
 
-PAGE = Path(__file__).resolve().parents[1] / 'reference' / 'parameters.md'
 HEAD = """# Parameters
 
 Made from [table.py](../../backlash_ros/core/parameters/table.py) by `make docs`; do not edit.
@@ -86,10 +85,6 @@ def _allowed(p: Parameter) -> str:
     if isinstance(p.default, bool):
         return '`true`, `false`'
     return ', '.join(filter(None, (p.rules, f'{p.length} numbers' if p.length else '')))
-
-
-def write_parameters() -> None:
-    PAGE.write_text(parameters_page(), encoding='utf-8')
 
 
 
@@ -222,10 +217,9 @@ def estimator_constants() -> str:
         (f'`{name}`', f'`{value}`', meaning) for name, value, meaning in found])
 
 
-def combinations() -> str:
-    return markdown(*combinations_of_laws.rows())
-
-
-TABLES: dict[str, Callable[[], str]] = {table.__name__: table for table in (
-    plant_facts, laws, printed_not_finite, printed_growth,
-    disturbance, uncertain_plants, combinations, estimator_constants)}
+TABLES: dict[str, Callable[[], str]] = {
+    'combinations': lambda: markdown(*combinations_of_laws.rows()),
+    **{table.__name__: table for table in (
+        plant_facts, laws, printed_not_finite, printed_growth, disturbance, uncertain_plants,
+        estimator_constants)},
+}

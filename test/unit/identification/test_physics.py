@@ -18,7 +18,7 @@ def identified() -> gear_runs.Identified:
 
 
 def test_identified_from_limits_alone_the_loop_removes_what_backlash_does(identified):
-    assert identified.said == 'of use'
+    assert (identified.refused, identified.found.reasons) == ('', ())
     assert identified.parameters is not None
     lost = SERVO.lost_motion
     assert identified.found.gap == pytest.approx(lost, rel=0.05)
