@@ -8,7 +8,6 @@ from math import hypot
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import toeplitz
 
 from backlash_ros.core.control.tracking.lq_preview import PreviewGains, preview_gains
 from backlash_ros.core.control.tracking.margin import Feedback, modulus_margin, tolerates
@@ -118,7 +117,10 @@ class TrackingDesign:
         held = []
         for gain in self.schedule:
             by_state = np.array(gain) @ rows
-            by_u = toeplitz(np.append(1.0, by_state @ self.model.b)[:length], np.zeros(length))[1:]
+            answers = np.append(1.0, by_state @ self.model.b)[:length]
+            # Without SciPy, which would take a controller 22 MB.
+            ago = np.subtract.outer(np.arange(len(answers)), np.arange(length))
+            by_u = np.tril(answers[np.maximum(ago, 0)])[1:]
             share = by_u.sum(axis=1)
             count = int(np.cumprod(share > 0.0).sum())  # beyond, it asks for more the more u is
             by_both = np.column_stack([-by_state[1:], by_u])[:count] / share[:count, None]
