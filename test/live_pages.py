@@ -31,6 +31,5 @@ def frames(address: str) -> Iterator[dict[str, Any]]:
 
 
 def listening_addresses(process: int) -> set[str]:
-    """Where a process accepts connections of TCP."""
     return {each.laddr.ip for each in psutil.Process(process).net_connections('tcp')
             if each.status == psutil.CONN_LISTEN}

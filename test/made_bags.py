@@ -56,7 +56,6 @@ def rows_of(
     run: RunRecord, labels: tuple[str, ...], skipped: frozenset[int], prefix: str = '',
     first: int = 1,
 ) -> Iterator[tuple[int, bytes]]:
-    """Number and message of each row, whose samples are counted from `first`."""
     for k in range(run.samples):
         if k in skipped:
             continue

@@ -61,7 +61,6 @@ def node_with(values: dict[str, object], domain: int) -> Iterator[ControllerNode
 
 
 def catch_commands(node: ControllerNode, sent: Callable[[float], None]) -> None:
-    """Let every command of the node come here, and reach the topic as well."""
     io: Any = node._io
     publish = io.publish
 
@@ -73,7 +72,6 @@ def catch_commands(node: ControllerNode, sent: Callable[[float], None]) -> None:
 
 
 def hand_over(node: ControllerNode, y_m: float | None, output: Output | None) -> None:
-    """Let the node hear a reference and an output, as if the messages had come."""
     untyped: Any = node
     if y_m is not None:
         untyped._on_reference({'': y_m})
@@ -82,7 +80,6 @@ def hand_over(node: ControllerNode, y_m: float | None, output: Output | None) ->
 
 
 def look_for_silence(node: ControllerNode) -> None:
-    """Let the node find that nothing was heard for longer than any timeout."""
     untyped: Any = node
     for loop in node.configured:
         loop.heard.y_at = -1e9

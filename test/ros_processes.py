@@ -90,7 +90,6 @@ class ForkedNode:
 def _run_node(
     executable: str, arguments: list[str], stdout: Path, stderr: Path, environment: dict[str, str],
 ) -> None:
-    """Become what `python -m backlash_ros.nodes.EXECUTABLE ARGUMENTS` is."""
     for path, number in ((stdout, 1), (stderr, 2)):
         with path.open('ab') as file:
             os.dup2(file.fileno(), number)
@@ -226,7 +225,6 @@ class RosWorld:
     def start(
         self, executable: str, parameters: Mapping[str, object] | None = None, *arguments: str,
     ) -> NodeProcess:
-        """Start a node with parameters, and further arguments as they are."""
         ros_arguments = ['--ros-args'] if parameters else []
         for name, value in (parameters or {}).items():
             text = value if isinstance(value, str) else json.dumps(value)

@@ -76,7 +76,6 @@ class Registers:
         self.table[address:address + size] = value.to_bytes(size, 'little', signed=size == 4)
 
     def write(self, address: int, data: bytes) -> int:
-        """Write whole registers in a row; returns the error, 0 for none."""
         changes = {}
         while data:
             size, low, high = WRITABLE.get(address, (0, 0, 0))
@@ -114,12 +113,10 @@ class EmulatedBus:
         self._measure()
 
     def answer(self, data: bytes) -> bytes:
-        """Take in bytes from the wire; returns those that the servos put onto it."""
         self._buffer += data
         return b''.join(status for one in self._instructions() for status in self._carry_out(*one))
 
     def _instructions(self) -> Iterator[tuple[int, int, bytes]]:
-        """Whole instructions with a right CRC: ID, instruction, parameters."""
         while True:
             start = self._buffer.find(HEADER)
             self._buffer = self._buffer[start:] if start >= 0 else self._buffer[-3:]
@@ -185,7 +182,6 @@ class EmulatedBus:
         return data
 
     def _move_on(self) -> None:
-        """Bring the arm to the present, then look at the watchdogs and measure."""
         now = self._clock()
         steps = int((now - self._moved_to) / STEP_S)
         self._moved_to += steps * STEP_S

@@ -84,7 +84,6 @@ class SimulatedLoop:
         return float(np.abs(np.array([e.m, e.c_r, e.c_l]) / TRUTH - 1.0).max())
 
     def check_sanity(self) -> None:
-        """Nothing was commanded that no plant can take, and y stayed where y_m is."""
         assert np.isfinite(self.sent).all()
         assert np.abs(self.sent).max() < LARGEST
         assert abs(self.driver.plant.measure()) < LARGEST

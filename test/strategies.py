@@ -33,7 +33,6 @@ class Play:
 
 @st.composite
 def plays(draw: st.DrawFn) -> Play:
-    """Any valid backlash, of the usual signs (c_l <= 0 <= c_r) or not."""
     m = draw(st.floats(0.05, 20.0))
     c_l = draw(st.floats(-50.0, 50.0))
     return Play(m, c_l + draw(st.floats(0.01, 50.0)), c_l)
@@ -41,7 +40,6 @@ def plays(draw: st.DrawFn) -> Play:
 
 @st.composite
 def usual_plays(draw: st.DrawFn) -> Play:
-    """A backlash around zero, as the projection of the estimators wants it."""
     return Play(
         draw(st.floats(0.1, 10.0)), draw(st.floats(0.05, 20.0)), draw(st.floats(-20.0, -0.05))
     )

@@ -13,7 +13,6 @@ def pause() -> None:
 def wait_until(
     condition: Callable[[], object], what: str, wait: Callable[[], None] = pause,
 ) -> None:
-    """Return once condition holds; wait() passes a moment. Raises TimeoutError."""
     deadline = time.monotonic() + DEADLINE_S
     while not condition():
         if time.monotonic() >= deadline:

@@ -101,7 +101,6 @@ class PacedDriver:
         )
 
     def text(self, key: str) -> str:
-        """A value in the newest diagnostics as it stands there, empty without it."""
         status = self.status()
         values: dict[str, Any] = {v.key: v.value for v in status.values} if status else {}
         return str(values.get(key, ''))
@@ -119,7 +118,6 @@ class PacedDriver:
         return max(abs(estimate[name] / true - 1.0) for name, true in TRUTH.items())
 
     def check_sanity(self) -> None:
-        """Nothing was commanded that no plant can take, and y stayed where y_m is."""
         commands = [message.data for message in self.controls]
         assert max(map(abs, commands)) < LARGEST_V
         assert max(map(abs, self.y)) < LARGEST_Y
@@ -152,7 +150,6 @@ class PacedDriver:
 def controller_and_driver(
     world: RosWorld, reports_applied: bool = False, **parameters: object,
 ) -> tuple[NodeProcess, PacedDriver]:
-    """A controller that knows the noise, and a driver that it hears."""
     controller = world.start('controller', {**OF_THE_LOOP, **parameters})
     driver = PacedDriver(world.probe(), reports_applied=reports_applied)
     driver.meet(controller)

@@ -70,7 +70,6 @@ def foreign_driver(folder: Path) -> str:
 
 
 def assert_same(found: RunRecord, simulated: RunRecord) -> None:
-    """Equal to the last bit, in all that does not tell of real time."""
     assert (found.samples, found.lost_samples) == (simulated.samples, simulated.lost_samples)
     for name in ('t', 'y_m', 'y', 'u_d', 'v', 'm', 'c_r', 'c_l', 'f', 'std_m', 'std_c_r',
                  'innovation', 'u_hat', 'status', 'u'):

@@ -32,7 +32,6 @@ def world(tmp_path: Path) -> Iterator[RosWorld]:
 
 
 def start_driver(world: RosWorld) -> None:
-    """Start a driver without a fault, which does not say which v it applies."""
     world.start('plant', BEHIND_THE_DRIVER, '--params-file', str(world.folder / 'driver.yaml'),
                 '-r', 'applied_control:=unheard')
 

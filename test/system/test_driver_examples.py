@@ -29,7 +29,6 @@ def commands_of_driver_page() -> list[list[str]]:
 
 
 def runnable(words: list[str]) -> list[str]:
-    """The command as it is run here: by this interpreter, and in less time."""
     program, *arguments = words
     name = program.removeprefix('.venv/bin/')
     modules = dict(
@@ -48,7 +47,6 @@ def runnable(words: list[str]) -> list[str]:
 
 
 def page_in_parts() -> list[list[list[str]]]:
-    """Commands grouped: those that run forever, then what is run beside them."""
     parts: list[list[list[str]]] = [[]]
     ended = False
     for words in commands_of_driver_page():
@@ -92,7 +90,6 @@ def run_or_start(
     words: list[str], environment: dict[str, str], folder: Path,
     started: list[subprocess.Popen[bytes]],
 ) -> None:
-    """Start what runs forever; run the rest, which has to do what it is for."""
     text = ' '.join(words)
     if any(mark in text for mark in FOREVER) and '--driver' not in words:
         started.append(subprocess.Popen(

@@ -54,7 +54,6 @@ class Arm:
         self.k = 0
 
     def refer(self, y_m: Mapping[str, float], velocity: float = 0.5) -> None:
-        """Send references, and let them arrive before what is sent next."""
         self._references.publish(JointState(
             name=list(y_m), position=list(y_m.values()), velocity=[velocity] * len(y_m)
         ))

@@ -60,7 +60,6 @@ def test_parameters_of_reference_and_plant_change_while_they_run(tmp_path: Path)
 
 
 def dumped(probe: Probe, node: str) -> dict[str, Any]:
-    """Name and value of every parameter, as `ros2 param dump` asks for them."""
     client = AsyncParameterClient(probe.node, node)
     probe.wait_until(client.services_are_ready, f'the parameters of {node}')
     names = sorted(probe.ask(client.list_parameters, 'the names').result.names)

@@ -33,7 +33,6 @@ def output_of(*command: object, **options: object) -> str:
 
 
 def colcon(folder: Path, *arguments: object) -> str:
-    """Standard output of colcon, run in an empty folder on this package."""
     return output_of(sys.executable, '-c', COLCON, '--log-base', folder / 'log', *arguments,
                      '--paths', ROOT, cwd=folder)
 

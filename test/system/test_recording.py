@@ -46,7 +46,6 @@ def recorded_samples(bag: Path) -> set[int]:
 
 
 def count_signals(bag: Path) -> int:
-    """Samples of the controller's signals that a recorder has flushed so far."""
     try:
         messages = BagReader(bag).messages()
     except BagError:  # not there yet
@@ -55,7 +54,6 @@ def count_signals(bag: Path) -> int:
 
 
 def go_on(probe: Probe, heard: list[Float64MultiArray], further: int) -> None:
-    """Hear further samples of the controller: nobody waits for a recorder."""
     wanted = len(heard) + further
     probe.wait_until(lambda: len(heard) >= wanted, 'further samples')
 

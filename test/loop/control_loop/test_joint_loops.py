@@ -19,7 +19,6 @@ Spoil = Callable[[int, Outputs], Outputs]
 
 
 def parameters() -> Parameters:
-    """An arm of joints with a lag behind their gaps; the gripper passes through."""
     values: dict[str, object] = {
         'joints': JOINTS, 'sample_period': PERIOD, 'control.rate_max': 20.0,
         'estimator.law': 'lms', 'estimator.initial.c_r': 0.02, 'estimator.initial.c_l': -0.02,

@@ -17,7 +17,6 @@ NAMES = ('m', 'c_r', 'c_l')
 
 
 def run(samples: int, fault: Callable[[int, float], float], **changes: float) -> RunRecord:
-    """The paper's example with noise, y as the sensor with this fault shows it."""
     loop = build_closed_loop(Parameters({
         'plant.uncertainty': 0.0, 'output_noise_std': NOISE, **changes,
     }))

@@ -37,7 +37,6 @@ class Arm:
         node.trigger_activate()
 
     def hear(self, y: Mapping[str, float]) -> list[str]:
-        """Let it hear outputs of the next sample; returns the joints that it answers."""
         self._k += 1
         before, stamp_ns, arrived = len(self.sent), START_NS + PERIOD_NS * self._k, time.time_ns()
         self.node._on_output({

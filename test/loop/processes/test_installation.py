@@ -76,7 +76,6 @@ def bare_clone(tmp_path: Path) -> Path:
 
 
 def one_line_of_ours(done: subprocess.CompletedProcess[str]) -> str:
-    """Return the only line of standard error besides those that make itself adds."""
     assert done.returncode != 0
     lines = [line for line in done.stderr.splitlines() if not line.startswith('make')]
     assert len(lines) == 1, done.stderr
@@ -126,7 +125,6 @@ assert compare.main(['--duration', '1', '--out', 'compare']) == 0
 
 
 def declared(name: str, known: set[str]) -> set[str]:
-    """The distributions that a distribution needs, itself included."""
     known.add(name)
     for text in distribution(name).requires or []:
         requirement = Requirement(text)

@@ -169,7 +169,6 @@ class LimitingDriver:
                                  loop.core.estimator))
 
     def write(self, folder: Path, run: RunRecord, without: str = '') -> Path:
-        """The folder of a run with its bag; without: a topic that was not recorded."""
         write_config(self._p, folder / 'parameters.yaml')
         sent = [(at, topic, FLOAT, float_message(value)) for at, topic, value in self.messages
                 if topic != without]

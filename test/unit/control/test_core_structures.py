@@ -171,7 +171,6 @@ def test_window_and_past_are_the_last_values_in_order(preview, history, values):
 
 
 def followed(values: np.ndarray, preview: int = 60) -> np.ndarray:
-    """r(k) as the trajectory takes it, of references that come one by one."""
     window = ReferenceWindow(preview, 10, np.ones(len(averages(preview))))
     window.fill(float(values[0]))
     return np.array([taken(window, value).item(0) for value in values.tolist()])[preview:]

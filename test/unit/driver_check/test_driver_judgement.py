@@ -76,7 +76,6 @@ def shifted(messages: list[Message], stamp_ns: int, received_ns: int) -> list[Me
 
 
 def with_outputs(change: Callable[[list[Message]], list[Message]]) -> Heard:
-    """What is heard of a good driver, but for this change of its outputs."""
     heard = heard_from_driver()
     heard.outputs = change(heard.outputs)
     return heard

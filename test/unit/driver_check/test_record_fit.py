@@ -20,7 +20,6 @@ def record(
     count: int, truth: Truth = TRUTH, model: TransferFunction = MODEL, noise: float = NOISE,
     seed: int = 0, delay: int = 0, size: float = 3.0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """v from k to k+1 and y at k; v comes into effect `delay` samples late."""
     v = swing(count + delay, size, seed)
     y = np.append(nan, output(model, v, truth, noise, seed))
     return v[delay:], y[:count]

@@ -58,7 +58,6 @@ def behind(u: Array, plant: str, noise: float = NOISE) -> Array:
 
 
 def observed(v: Array, y: Array, gap: float = GAP, noise: float = NOISE) -> Observed:
-    """With the best that a play of this gap and a dozen lags can do."""
     p = play(v, gap)
     columns = [np.ones(len(v)), K[:len(v)] * 1e-3, np.cumsum(p - p.mean())]
     columns += [np.append(np.full(k, p[0]), p[:len(p) - k]) for k in range(12)]

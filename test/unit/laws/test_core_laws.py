@@ -153,7 +153,6 @@ def test_lost_samples_do_not_put_it_out_of_step(model: TransferFunction, lost: s
 
 @pytest.mark.parametrize('noise_std', [1e-4, 1e-3])
 def test_it_is_the_least_squares_solution_of_random_walk_and_noise(noise_std: float) -> None:
-    """Against one batch solution over all samples, which knows no recursion."""
     samples, lag = 200, 20
     rng = np.random.default_rng(3)
     y = output_of(PAPER, np.cumsum(rng.standard_normal(samples)))
@@ -173,7 +172,6 @@ def test_it_is_the_least_squares_solution_of_random_walk_and_noise(noise_std: fl
 
 
 def test_lag_shorter_than_the_delay_of_the_plant_is_refused() -> None:
-    """y(k) cannot tell u(k - 3) yet when it takes u five samples to reach y."""
     model = TransferFunction([1.0], [1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     with pytest.raises(ParameterError) as refusal:
         InputReconstruction(model, 0.0, 3)

@@ -35,7 +35,6 @@ WELL = LoopFigures(
 
 
 def replace(figures: LoopFigures, **changes: Any) -> LoopFigures:
-    """With other values, of whichever part of the figures has them."""
     for part in ('timing', 'around', 'learning'):
         present = getattr(figures, part)
         own = {name: changes.pop(name) for name in present._fields if name in changes}

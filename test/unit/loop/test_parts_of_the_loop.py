@@ -95,7 +95,6 @@ def test_trouble_that_was_not_told_is_not_told_to_be_over() -> None:
 
 
 def stamped(ticks: Iterable[float], period_s: float) -> DriverPeriod:
-    """What is known of a driver that has sent messages at these times [periods]."""
     sender = DriverPeriod(period_s)
     for tick in ticks:
         sender.follow(1_800_000_000_000_000_000 + round(tick * period_s * 1e9))

@@ -26,7 +26,6 @@ delays = st.lists(st.floats(0.0, 0.08), min_size=61, max_size=61)  # of a period
 
 
 def stamps_of(gaps: list[int], delays: list[float]) -> list[int]:
-    """Time stamps of samples 0, 1 + gaps[0], ... that leave with some delay."""
     samples = [0]
     for gap in gaps:
         samples.append(samples[-1] + 1 + gap)

@@ -33,7 +33,6 @@ def refusal_of(name: str, value: object) -> str:
 
 
 def something_valid(parameter: Parameter) -> float:
-    """A value of the parameter, or of an element of it, well inside its bounds."""
     if parameter.low > -inf:
         return min(parameter.low + 1.0, 0.5 * (parameter.low + parameter.high))
     return parameter.high - 1.0 if parameter.high < inf else 1.0

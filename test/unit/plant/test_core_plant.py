@@ -22,7 +22,6 @@ from backlash_ros.core.plant.transfer_function import TransferFunction
 
 def as_printed(u_before: Fraction, v: Fraction, m: Fraction, c_r: Fraction, c_l: Fraction,
                ) -> tuple[Fraction, Region]:
-    """The three cases of (2.1), word for word, in exact arithmetic."""
     v_l = u_before / m + c_l
     v_r = u_before / m + c_r
     if v <= v_l:
@@ -118,7 +117,6 @@ def test_wear_moves_the_backlash_with_time_and_the_jump_comes_at_its_time() -> N
     {'backlash__rate': [-1.0, 0.0, 0.0]},
 ], ids=['jump to m < 0', 'jump to c_l = c_r', 'm falls below 0 after 1.3 s'])
 def test_wear_never_ends_in_an_invalid_backlash(changes: dict[str, list[float]]) -> None:
-    """It is refused at the start, or when it gets there, but never simulated."""
     with pytest.raises(ParameterError) as refusal:
         outputs(build_plant(paper_example(**changes)), [0.0] * 400)
     assert refusal.value.name.startswith('backlash.')
@@ -128,7 +126,6 @@ PERIOD = 0.005
 
 
 def motor(frequency: float = 20.0, damping: float = 0.5) -> TransferFunction:
-    """The load of geared_motor.yaml by an independent discretisation."""
     w = 2.0 * pi * frequency
     numerator, denominator, _ = cont2discrete(
         ([w * w], [1.0, 2.0 * damping * w, w * w]), PERIOD, 'zoh'

@@ -74,7 +74,6 @@ def console_scripts() -> set[str]:
 
 
 def anchors(page: Path) -> set[str]:
-    """Return the anchors of the headings, as they are formed on the web."""
     headings = re.findall(r'^#+ (.*)$', page.read_text(), re.MULTILINE)
     return {re.sub(r'[^\w\- ]', '', heading.lower()).replace(' ', '-') for heading in headings}
 

@@ -44,7 +44,6 @@ def write_numbers(path: Path, storage: str, each: Callable[[Bag], None] = Bag.fl
 
 
 def numbers_in(bag: Path) -> list[float]:
-    """What was written to /number, as rosbags finds it in a complete bag."""
     with AnyReader([bag]) as reader:
         return [
             reader.deserialize(raw, connection.msgtype).data

@@ -148,7 +148,6 @@ def test_foreign_program_gets_no_variables_that_were_made_for_this_python() -> N
 
 
 def planned(folder: Path, *arguments: str) -> RunPlan:
-    """The plan that these arguments lead to, its files in the folder."""
     return prepare(bringup.parse_options(
         ['--config', str(CONFIG), '--out', str(folder), *arguments]
     ))
