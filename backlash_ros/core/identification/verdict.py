@@ -105,12 +105,14 @@ class Doubt(NamedTuple):
 
 def judge(f: Findings) -> Verdict:
     """The answers to three questions."""
-    other_plays = [*_coasts(f), *_changes(f)]
+    coasts = [*_coasts(f)]
+    other_plays = [*coasts, *_changes(f)]
     doubts = [*_doubts(f), *other_plays]
     spread = float(np.linalg.norm([doubt.deviation for doubt in doubts]))
     told = [doubt for doubt in other_plays if doubt.deviation > WORTH_A_WORD * f.gap]
+    far = [doubt for doubt in coasts if doubt.deviation > PRECISE * f.gap]
     # What the play is makes other orders fit as well.
-    backlash = what_it_is(f.observed) or _backlash(f, max(told or doubts), spread)
+    backlash = what_it_is(f.observed) or _backlash(f, max(far or told or doubts), spread, bool(far))
     remarks = [*_remarks(f), *(doubt.why for doubt in told if backlash.known)]
     return Verdict(backlash, _gain(f), _model(f), spread, tuple(remarks))
 
@@ -170,8 +172,8 @@ def _changes(f: Findings) -> Iterator[Doubt]:
                         f'the gap changes {what}: ' + ', '.join(f'{gap:.3g}' for gap in gaps), cure)
 
 
-def _backlash(f: Findings, most: Doubt, spread: float) -> Answer:
-    """Whether the gap is known, or that there is none."""
+def _backlash(f: Findings, most: Doubt, spread: float, coasts: bool) -> Answer:
+    """Whether the gap is known, or that there is none. coasts: so far that it is another one."""
     roughly = 0.25  # relative deviation of a gap that is known
     p, swing = f.observed.p, f.swing
     way = np.sign(np.diff(p))
@@ -193,7 +195,7 @@ def _backlash(f: Findings, most: Doubt, spread: float) -> Answer:
     of_noise = most.deviation <= max(f.gap_std, 0.3 * f.unexplained)
     if f.gap <= CERTAIN * spread and of_noise and not unexplained:
         return _no_gap(f, spread)
-    if spread <= roughly * f.gap and not unexplained:
+    if spread <= roughly * f.gap and not unexplained and not coasts:
         rough = f', known to {100.0 * spread / f.gap:.2g} % only' * (spread > PRECISE * f.gap)
         return Answer(True, f'the gap is {f.gap:.4g} ± {spread:.2g}{rough}')
     return Answer(False, f'the gap, about {f.gap:.3g}, is known to ± {spread:.2g} only: {most.why}',

@@ -116,7 +116,7 @@ def test_a_load_that_coasts_is_told_with_the_gap_that_it_hides() -> None:
         # On by what is left of the last step, as far as the sides of the gap let it.
         on = u[-1] + 0.97 * (u[-1] - u[-2])
         u.append(min(max(on, value - half), value + half))
-    found = judge(FOUND._replace(observed=observed(V, behind(np.array(u[1:]), 'lag'), 0.3)))
+    found = judge(FOUND._replace(observed=observed(V, behind(np.array(u[1:]), 'lag'), 0.5)))
     assert not found.backlash.known
     reason, _, hidden = found.backlash.reason.partition('the load coasts while v crosses the gap')
     assert reason
