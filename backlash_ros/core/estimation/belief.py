@@ -136,14 +136,15 @@ def published(setup: Setup, belief: Belief) -> Belief:
     assert fit is not None
     if belief.inherited is not None:
         return _beside_inherited(setup, belief, fit, belief.inherited)
-    if belief.coasts or not is_known(setup, fit, settings.REVERSALS):
+    if not is_known(setup, fit, settings.REVERSALS):
         return replace(belief, reason=Status.INCONSISTENT)
     if belief.trial.predicted < belief.trial.must:
         return belief
     cov = fit.crossings_cov + np.diag(setup.drift**2 * (belief.end - belief.kept.first) / 3.0)
     walked = (fit.walk_std / fit.m) ** 2 * (belief.next_at - belief.end)
     cov += walked * np.outer([0.0, 1.0, 1.0], [0.0, 1.0, 1.0])
-    return replace(belief, published=Known(fit.crossings, cov), reason=Status.TRACKING)
+    return replace(
+        belief, published=Known(fit.crossings, cov), reason=Status.TRACKING, coasts=False)
 
 
 def _beside_inherited(setup: Setup, belief: Belief, fit: WindowFit, known: Known) -> Belief:
