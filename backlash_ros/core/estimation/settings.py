@@ -7,7 +7,7 @@ from __future__ import annotations
 
 # --- what counts as known
 STD_SLOPE = 0.2  # standard deviation of m over m, below which an estimate is published
-STD_GAP = 0.3  # that of gap and crossings over the gap; both for BY_CHANCE deviations if correlated
+STD_GAP = 0.3  # that of gap and crossings over the gap: BY_CHANCE of them if residuals correlate
 REVERSALS = 2  # changes of the engaged side before a first estimate where G is uncertain
 NEGLIGIBLE = 0.1  # motion that nothing explains, or a gap, that counts as none: over the gap
 LOST_MOTION = 0.02  # by which the gap of a gear differs from one motion to another, over the gap
