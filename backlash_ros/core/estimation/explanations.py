@@ -245,7 +245,7 @@ def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]
                     theta=best.theta + best.cov[:, 2] * reach / std,
                 )
                 for _ in range(FEW_STEPS):
-                    there = p.kept(p.step(there, held=True))
+                    there = p.step(there, held=True)
                 behind = max(likeliest - p.log_posterior(there, weights), 1.0)
                 if nearer <= 2.0:
                     apart = there.crossings - best.crossings

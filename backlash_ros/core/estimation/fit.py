@@ -156,9 +156,10 @@ class Problem:
     ) -> WindowFit:
         """The values that the linearization around f makes likeliest, with their posterior.
 
-        held: whether the gap stays, so that all else fits it; begun: whether the beginning does.
-        Raises LinAlgError where the numbers get too large.
+        Gap and beginning are where they can be. held: whether the gap stays, so that all else fits
+        it; begun: whether the beginning does. Raises LinAlgError where the numbers get too large.
         """
+        least = 1e-9  # gap over the swing of v: with none at all, neither side would be told
         from scipy.linalg.lapack import dtrtri  # where fits are made: 31 MB
 
         r, run = self._triangle(f, held, begun), self.at(f)
@@ -176,12 +177,16 @@ class Problem:
         xi, cov_xi, scale, volume, noise = error_of_plant(
             f, r[n:, n:], squares, freedom, most_scale)
         beta = of_eta @ r[:n, -1] + of_xi @ xi
+        swing, first = float(np.ptp(self.v)), float(self.v[0])
+        beta[at + 2] = gap = min(max(beta[at + 2], least * swing), 2.0 * swing)
+        p0 = float(beta[at - 1])
         cov = noise * of_eta @ of_eta.T + of_xi @ cov_xi @ of_xi.T
         volume -= float(np.log(np.maximum(diagonal, 1e-300)).sum())
         if f.walk_std:
             volume -= len(self._walk) * log(self._knot_std(f))
         return replace(
-            f, x=beta[:order], knots=beta[order:at - 1], p0=float(beta[at - 1]), theta=beta[at:],
+            f, x=beta[:order], knots=beta[order:at - 1], theta=beta[at:],
+            p0=p0 if self.start is not None else min(max(p0, first), first + gap),
             scale=scale, cov=cov[at:, at:], volume=volume,
         )
 
@@ -292,12 +297,12 @@ class Problem:
     ) -> tuple[WindowFit, WindowFit, float]:
         """What a step leads to, where it goes as far as that helps, and its log-posterior."""
         shortest_step = 0.05  # share of a Gauss-Newton step that is tried
-        new = self.kept(self.step(f, most_scale, begun=begun))
+        new = self.step(f, most_scale, begun=begun)
         there = _towards(f, new)
         value = self.log_posterior(there, weights)
         if -inf < value <= best - 0.5:
             # Beyond a kink of the play, where another side was engaged, it may be better.
-            again = _towards(there, self.kept(self.step(there, most_scale, begun=begun)))
+            again = _towards(there, self.step(there, most_scale, begun=begun))
             of_again = self.log_posterior(again, weights)
             if of_again > best:
                 there, value = again, of_again
@@ -307,15 +312,6 @@ class Problem:
             there = _towards(f, new, length)
             value = self.log_posterior(there, weights)
         return new, there, value
-
-    def kept(self, f: WindowFit) -> WindowFit:
-        """The same with its gap and its beginning where they can be."""
-        least = 1e-9  # gap over the swing of v: with none at all, neither side would be told
-        swing, first = float(np.ptp(self.v)), float(self.v[0])
-        gap = min(max(f.gap, least * swing), 2.0 * swing)
-        theta = np.concatenate([f.theta[:2], [gap], f.theta[3:]])
-        p0 = f.p0 if self.start is not None else min(max(f.p0, first), first + gap)
-        return replace(f, theta=theta, p0=p0)
 
     def _noise_of(self, f: WindowFit) -> float:
         run = self.at(f)
