@@ -85,7 +85,6 @@ def identify_joint(joint: Joint, folder: Path) -> None:
 
 
 def identified(folder: Path) -> dict[str, object]:
-    """Parameters of the arm, with what `identify` has written of each joint."""
     values: dict[str, object] = {
         **shared_parameters(), 'estimates.load': True,
         'estimates.file': str(folder / '{joint}' / 'estimates.json'),

@@ -63,7 +63,6 @@ def show(seed: int) -> int:
 
 
 def rows_of(results: list[Result]) -> list[list[str]]:
-    """A line for each kind: how many sequences, and their seeds."""
     seeds = {kind: [str(one.seed) for one in results if kind in one.found] for kind in KINDS}
     return [[what, str(len(seeds[kind])), ', '.join(seeds[kind])] for kind, what in KINDS.items()]
 

@@ -190,7 +190,6 @@ class Result:
 
 
 def all_cases(seeds: Sequence[int]) -> Iterator[Case]:
-    """Every motion with every plant at 200 Hz, some at other rates."""
     for rate in RATES:
         motions, plants = (MOTIONS, PLANTS) if rate == RATES[0] else AT_OTHER_RATES
         for motion in motions:
@@ -330,7 +329,6 @@ HEADER = ('case', 'runs', 'as due', 'learned', 'reversals', 'error at 5 [gap]', 
 
 
 def row(name: str, results: Sequence[Result]) -> list[str]:
-    """One row of the table: the figures of the runs of one case or motion."""
     figures = [f'{one.value:.3g}' if one.runs else '–' for one in figures_of(results).values()]
     return [name, str(len(results)), *figures]
 

@@ -129,7 +129,6 @@ def row_of(one: Case) -> list[str]:
 
 
 def wrong(cases: list[Case]) -> list[list[str]]:
-    """Where a bound is missed, with the command that shows it."""
     rows = []
     for one in cases:
         for name, loop in zip(FROM, one.loops, strict=True):
@@ -143,7 +142,6 @@ def wrong(cases: list[Case]) -> list[list[str]]:
 
 
 def draw_hysteresis() -> Figure:
-    """Hysteresis loops of all presets, behind the command and behind the motor."""
     figure = Figure(figsize=(15, 6), layout='constrained')
     axes = figure.subplots(2, len(PRESETS))
     for (above, below), (name, gear) in zip(axes.T, PRESETS.items(), strict=True):

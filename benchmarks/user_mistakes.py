@@ -170,7 +170,6 @@ SOUND: dict[str, tuple[str, tuple[str, ...], int]] = {
 
 
 def check_mistake(name: str) -> Check:
-    """Make a mistake and look for the line that names it."""
     words, fault, made = MISTAKES[name]
     with scene(fault) as (on, driver):
         if made is not None:

@@ -181,7 +181,6 @@ def _without_noise(seed: int, below_corners: bool = False) -> Case:
 
 
 def _slowest(denominator: Array) -> float:
-    """Longest time constant of the poles that are no integrators [samples]."""
     sizes = [abs(pole) for pole in np.roots(denominator) if abs(pole - 1.0) >= NEAR_ONE]
     return float(-1.0 / np.log(max(sizes))) if sizes else 0.0
 

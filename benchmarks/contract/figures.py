@@ -79,7 +79,6 @@ def share(values: Sequence[float | bool | None], better: Better = 'less') -> Fig
 
 
 def upper(values: Array) -> float:
-    """The value that nine of ten runs stay below."""
     return float(np.quantile(values, 0.9))
 
 

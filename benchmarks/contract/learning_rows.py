@@ -233,7 +233,6 @@ def plants_jobs(structure: str, scale: float) -> list[Job]:
 
 
 def plants_figures(outcomes: Sequence[Outcome]) -> dict[str, Figure]:
-    """Figures of each group, and how well y follows."""
     return by_group(outcomes, lambda of: {
         **figures_of([one.judged for one in of], (0.5, 2.0, 10.0)),
         'y follows, median': figure([one.follows for one in of]),

@@ -46,7 +46,6 @@ def times_figures(found: Sequence[Times]) -> dict[str, Figure]:
 
 
 def step_jobs(scale: float) -> list[tuple[str, int]]:
-    """The default law in both structures."""
     return repeated(scale, ('proportional', 'tracking'), 6)
 
 
@@ -70,7 +69,6 @@ def run_step(job: tuple[str, int]) -> Times:
 
 
 def latency_jobs(scale: float) -> list[tuple[str, int]]:
-    """The default law in both structures, and one that fits nothing."""
     return repeated(scale, ('proportional', 'tracking', 'lms'), 4)
 
 
@@ -116,7 +114,6 @@ GAP, B, A = 0.3, [0.0, 0.05, 0.045], [1.0, -1.6, 0.695]
 
 
 def identify_jobs(scale: float) -> list[tuple[str, int]]:
-    """Records of the lengths that users have."""
     return repeated(scale, tuple(IDENTIFIED), 3)  # fewer show no scatter
 
 

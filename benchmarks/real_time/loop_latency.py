@@ -124,7 +124,6 @@ class Driver(MeasuringNode):
 def measure_latency(
     rate: float, law: str, duration_s: float, changes: Mapping[str, object] | None = None,
 ) -> Latencies:
-    """Latency of a controller process with this law at this rate, beside an echo."""
     # The same waves per sample at every rate: G is given in samples, not in seconds. While the
     # echo is asked the controller hears nothing, which is no silence of the driver.
     parameters = Parameters({

@@ -87,7 +87,6 @@ def draw_figure_4() -> Figure:
 
 
 def draw_figure_5() -> Figure:
-    """Control errors of the laws on the paper's example, as Figure 5."""
     run = simulate(5.0)
     return drawn.draw_error_curves(*compare_laws(run.record, run.parameters)[:2])
 

@@ -57,7 +57,6 @@ class View:
             else Circle((x, y), w, color=colour))
 
     def turn(self, *angles: float) -> None:
-        """Show motor, load and reference at angles [rad], clockwise."""
         for patches, angle in zip(self._parts, angles, strict=True):
             for patch in patches:
                 patch.set_transform(Affine2D().rotate(-MAGNIFIED * angle) + self._axes.transData)
