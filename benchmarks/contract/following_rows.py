@@ -14,7 +14,7 @@ import numpy as np
 from cases.loops import NINE_DIGITS, load_model, loop_on, motor, without_sensor
 from cases.random_cases import random_case
 from contract.figures import Array, Figure, by_group, figure, rms, share, upper
-from scipy.signal import sawtooth
+from scipy.signal import cont2discrete, sawtooth
 
 from backlash_ros.core import Parameters, Status, build_closed_loop
 from backlash_ros.core.assembly import build_model
@@ -140,7 +140,8 @@ def following_figures(found: Sequence[Followed]) -> dict[str, Figure]:
 
 LONGEST_S, MOST_SAMPLES = 40.0, 5000
 LEAST_TURN = 0.01  # share of m gap by which u* turns at least
-MOTIONS = ('sine', 'triangle', 'steps', 'moves')
+PLANTS = ('motor', 'paper', 'integrator')
+MOTIONS = ('sine', 'triangle', 'steps', 'moves', 'sines')
 CONSTANTS = ('exact', '3 % off', 'learned')
 
 
@@ -174,12 +175,16 @@ def moves_with_rests(
 def case_of(seed: int) -> tuple[dict[str, Any], Array, Array, tuple[str, str]]:
     """Parameters, the reference, as it is heard, the motion and what is known of the constants."""
     rng = np.random.default_rng([seed, 37])
-    plant, motion = ('motor', 'paper')[seed % 2], MOTIONS[seed // 2 % 4]
-    constants = CONSTANTS[seed // 8 % 3]
+    plant, motion = PLANTS[seed % 3], MOTIONS[seed // 3 % 5]
+    constants = CONSTANTS[seed // 15 % 3]
     period_s = float(1.0 / np.exp(rng.uniform(np.log(50.0), np.log(1000.0))))
     omega = float(np.exp(rng.uniform(np.log(0.4), np.log(10.0))))
-    model = TransferFunction(*load_model(period_s)) if plant == 'motor' \
-        else altered_plant(build_model(Parameters({})), period_s / 0.01)
+    if plant == 'integrator':
+        b, a, _ = cont2discrete(([20.0], [1.0, 20.0, 0.0]), period_s)
+        model = TransferFunction(b[0, 1:], a)
+    else:
+        model = TransferFunction(*load_model(period_s)) if plant == 'motor' \
+            else altered_plant(build_model(Parameters({})), period_s / 0.01)
     values: dict[str, Any] = {
         **(motor() if plant == 'motor' else {}), 'sample_period': period_s,
         'plant.numerator': model.numerator.tolist()[1:],
@@ -206,6 +211,7 @@ def case_of(seed: int) -> tuple[dict[str, Any], Array, Array, tuple[str, str]]:
         'sine': lambda: np.sin(omega * t), 'triangle': lambda: sawtooth(omega * t + 0.5 * pi, 0.5),
         'steps': lambda: np.sign(np.sin(omega * t + 1e-9)),
         'moves': lambda: moves_with_rests(rng, period_s, omega, float(t[-1]) + period_s)[:len(t)],
+        'sines': lambda: sum(np.sin(omega * f * t) for f in (0.37, 1.0, 1.71)) / 3.0,
     }[motion]()
     heard = wanted + heard_noise * rng.standard_normal(len(t))
     return values, wanted, heard, (motion, constants)
