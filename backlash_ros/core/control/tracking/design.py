@@ -132,11 +132,6 @@ class TrackingDesign:
         """|K| of each."""
         return [hypot(*gain) for gain in self.schedule]
 
-    @cached_property
-    def plan_noise(self) -> list[float]:
-        """What each plan makes of noise of 1 in references averaged over the widest parabola."""
-        return [plan.noise_gains.item(-1) for plan in self.plans]
-
 
 def design(model: StateModel, weights: Weights, weight_factor: float = 1.0) -> TrackingDesign:
     """The gains for a model of G.

@@ -44,11 +44,6 @@ class HandOver:
     widens: bool = False
     leading: bool = False
 
-    def fade(self) -> float:
-        """What is added to u_d at this sample."""
-        added, self.added = self.added, FADING * self.added
-        return added
-
 
 class Tracking(ControlStructure):
     """u_d = u* - K (x - x*) - K_q (q - q*) around the ideal trajectory u*, x*, q* of G alone.
@@ -124,7 +119,7 @@ class Tracking(ControlStructure):
         assert isinstance(gains, TrackingDesign)
         self.prepare()
         self._use(gains)
-        self._prepare_feedback(source.x_cov)
+        self.feedback.prepare(source.x_cov, self._noise_std, *self.trajectory.noise)
         self._change_trajectory(source)
 
     def _change_trajectory(self, source: StateSource) -> None:
@@ -167,7 +162,8 @@ class Tracking(ControlStructure):
         u_d = plan.aim - correction
         if feedback.knows_noise:
             u_d = self._without_crossing(u_d, plan.aim - worth, noise, deviation, inverse)
-        added = self.hand_over.fade()
+        added = self.hand_over.added
+        self.hand_over.added *= FADING
         u_d += added
         pull, before = rest.pull_back(deviation, feedback.most), rest.state.mode
         spread = max(references.high, y_m) - min(references.low, y_m) - references.noise_spread
@@ -198,14 +194,9 @@ class Tracking(ControlStructure):
             self._newest = None
             self._y_noise.take(y)
             self.trajectory.prepare()
-            self._prepare_feedback(x_cov)
+            self.feedback.prepare(x_cov, self._noise_std, *self.trajectory.noise)
             if self.feedback.trust.full and self.trajectory.soften(self.feedback.gap_u):
                 self._change_trajectory(source)
-
-    def _prepare_feedback(self, x_cov: NDArray[np.float64] | None) -> None:
-        trajectory = self.trajectory
-        self.feedback.prepare(
-            x_cov, self._noise_std, trajectory.x_noise, trajectory.references.noise_std)
 
     def _go_on(self, estimate: Estimate, inverse: BacklashInverse) -> None:
         """Take in the estimate, and v from whoever has made it until now."""

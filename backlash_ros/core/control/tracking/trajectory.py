@@ -97,8 +97,9 @@ class IdealTrajectory:
 
         Returns whether it does.
         """
-        of_noise, noise_std = self._design.plan_noise, self.references.noise_std
-        now = of_noise[self.softness]
+        # What each plan makes of noise that is averaged over the widest parabola.
+        of_noise = [plan.noise_gains.item(-1) for plan in self._design.plans]
+        now, noise_std = of_noise[self.softness], self.references.noise_std
         if gap_u == 0.0 or noise_std * now <= QUIET * gap_u:
             return False
         softer = next((i for i, gain in enumerate(of_noise) if noise_std * gain <= QUIET * gap_u),
@@ -174,10 +175,10 @@ class IdealTrajectory:
         return state.side is not before
 
     @property
-    def x_noise(self) -> Array:
-        """Covariance of x* for noise of 1 in references that are averaged as those in use."""
+    def noise(self) -> tuple[Array, float]:
+        """Covariance of x* for noise of 1 in references averaged as these are, and their noise."""
         by_width = np.abs(self._plan.noise_gains - self.references.u_noise_gain)
-        return self._plan.x_noise[int(by_width.argmin())]
+        return self._plan.x_noise[int(by_width.argmin())], self.references.noise_std
 
     def advance(self) -> None:
         """Go on to the next sample."""
