@@ -169,9 +169,11 @@ class IdealTrajectory:
         if (ahead[0] - state.extreme) * state.side > 0.0 and not state.decided:
             state.extreme = ahead[0]
         state.turns_in = turns_in if state.side is before else 0
-        # What is no turn is not followed there and back, but to where it ends.
-        turns = state.turns_in < len(ahead)
-        state.furthest = max(ahead, key=lambda u: u * state.side) if turns else ahead[-1]
+        state.furthest = max(ahead, key=lambda u: u * state.side)
+        after = ahead[ahead.index(state.furthest):]
+        if state.turns_in == len(ahead) and min(after, key=lambda u: u * state.side) != ahead[-1]:
+            # A swing that is no turn, and over: it is not followed there and back.
+            state.furthest = ahead[-1]
         return state.side is not before
 
     @property
