@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 from math import nan
 
 import numpy as np
+from fault_loop.fault_world import Actuator, Driver, Sensor
 
 from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.control.limits import Limits
@@ -16,7 +17,6 @@ from backlash_ros.core.loop.finding import Level
 from backlash_ros.core.loop.loop_statistics import Lately
 from backlash_ros.core.loop.sample_counter import SampleCounter, kept_outputs
 from backlash_ros.core.parameters import Parameters
-from fault_loop.fault_world import Actuator, Driver, Sensor
 
 
 class Controller:

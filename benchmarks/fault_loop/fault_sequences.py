@@ -6,6 +6,9 @@ from math import isfinite
 
 import numpy as np
 from cases.random_cases import NEAR_ONE
+from fault_loop.fault_controller import Controller
+from fault_loop.fault_world import PERIOD_S, SENSOR_FAULTS, Actuator, Driver, Sensor, parameters_of
+from fault_loop.promises import PromisedBound, Uninterrupted
 
 from backlash_ros.core.assembly import build_model, build_true_model
 from backlash_ros.core.control.controller import ControlStep
@@ -16,9 +19,6 @@ from backlash_ros.core.estimates_file import was_given
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.transfer_function import TransferFunction
-from fault_loop.fault_controller import Controller
-from fault_loop.fault_world import PERIOD_S, SENSOR_FAULTS, Actuator, Driver, Sensor, parameters_of
-from fault_loop.promises import PromisedBound, Uninterrupted
 
 SAMPLES = (300, 800)
 PAUSE = (15, 120)  # samples from one event to the next
