@@ -73,13 +73,13 @@ def identify(
     v, y = np.asarray(v, dtype=float), np.asarray(y, dtype=float)
     check_record(v, y)
     part = busiest(v, y)
+    nothing = _why_nothing(v, y[part], options)
+    if nothing:
+        return Identification(sample_period, v, y, refused=nothing)
     slow = rate_limit(v[part], y[part])
     if slow is not None:
         v = limited(v, slow)
     given = Identification(sample_period, v, y)
-    nothing = _why_nothing(v, y[part], options)
-    if nothing:
-        return replace(given, refused=nothing)
     units = Units(float(v.mean()), float(np.ptp(v[part])), float(np.nanmedian(y)),
                   float(np.nanstd(y[part])))
     v, y = (v - units.v) / units.v_size, (y - units.y) / units.y_size

@@ -229,7 +229,7 @@ class Tracking(ControlStructure):
 
         What is behind the u that is held makes v cross the gap; what is beyond the furthest u* has
         to come back across it, and has to be more than noise. What is not must not go beyond the
-        trajectory by so much that feedback will want it back either.
+        trajectory by so much that feedback will want it back either, but for what hands v over.
         """
         plan, side, (c_r, c_l) = self.trajectory.state, inverse.side, self.feedback.trust.crossings
         if side is Region.GAP or side is not plan.side or c_r == c_l:
@@ -238,7 +238,7 @@ class Tracking(ControlStructure):
         least, most = min(worth * side, held), max(plan.furthest * side, held)
         if worth * side > most + noise:
             most = worth * side
-        elif wanted * side > max(plan.aim * side, held):
+        elif abs(self.hand_over.added) <= noise and wanted * side > max(plan.aim * side, held):
             furthest = self.feedback.furthest(deviation, plan.ahead, side, plan.turns_in)
             most = max(min(most, furthest * side), plan.aim * side, held)
         return min(max(wanted * side, least), most) * side
