@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 
 
 class State(Enum):
-    """How the fit stands to the newest samples; states.py has the table of transitions."""
+    """How the fit stands to the newest samples; state_machine.py has the table of transitions."""
 
     SEARCHING = auto()
     KNOWN = auto()

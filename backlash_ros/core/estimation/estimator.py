@@ -4,8 +4,8 @@ Moving-horizon estimation of the gap, the slope, the crossings, the error of G, 
 state of G at once (C. V. Rao, J. B. Rawlings, D. Q. Mayne, Constrained state estimation for
 nonlinear discrete-time systems, IEEE Trans. Automatic Control 48 (2003) 246-258). `update` takes
 in a sample: play operator and observer advance (observer.py). `refine` has the newest record
-fitted where that is due (states.py), in a worker process or at once, and goes on from its result,
-whichever sample that belongs to. docs/estimation.md explains the method and measures it.
+fitted where that is due (state_machine.py), in a worker process or at once, and goes on from its
+result, whichever sample that belongs to. docs/estimation.md explains the method and measures it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from backlash_ros.core.estimation.explanations import Setup, Window, forbidden
 from backlash_ros.core.estimation.observer import Following, Gain, Place, gains_of, place_of
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.settings import FEWEST, FIRST_FIT, HELD_REVERSALS, LONGEST
-from backlash_ros.core.estimation.states import learn
+from backlash_ros.core.estimation.state_machine import learn
 from backlash_ros.core.jobs.executor import ChannelSamples, Executor, Failure
 from backlash_ros.core.law import Interval, Law, LawReport
 from backlash_ros.core.laws.fixed import FixedBacklash

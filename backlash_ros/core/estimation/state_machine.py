@@ -46,10 +46,9 @@ from backlash_ros.core.estimation.explanations import (
     of_xi,
     outliers,
     problem_of,
-    with_intervals,
-    with_walk,
 )
 from backlash_ros.core.estimation.fit import FEW_STEPS, Problem
+from backlash_ros.core.estimation.noise import with_intervals, with_walk
 from backlash_ros.core.estimation.posterior import WindowFit
 from backlash_ros.core.estimation.score_tests import coasts, likelier
 from backlash_ros.core.estimation.settings import FEWEST, MISFIT, PREDICTED, SHORT_RECORD
@@ -237,7 +236,7 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
                 other = None
         if short or fit.spread.any():  # else it has been normal for long
             fit = mixed(problem, fit, () if other is None else (other,))
-        fit = with_walk(setup, problem, fit)
+        fit = with_walk(problem, fit, setup.walk_std)
         after = replace(
             after, thorough=Look(record.end + 2 * count // 5, 0.5 * fit.gap_std))
     else:
