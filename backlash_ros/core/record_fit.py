@@ -40,13 +40,21 @@ class RecordFit:
     outside: tuple[str, ...] = ()
     estimates: Mapping[str, tuple[float, float]] = field(
         default_factory=lambda: dict.fromkeys(('m', 'c_r', 'c_l'), (nan, nan)))
-    gap: float = nan
-    std_gap: float = nan
     fit: WindowFit | None = None
     predicted: float = nan
     reversals: int = 0
     delay: int = 0
     margins: Mapping[int, float] = field(default_factory=dict)
+
+    @property
+    def gap(self) -> float:
+        """Width, nan where there is no fit."""
+        return self.fit.gap if self.fit else nan
+
+    @property
+    def std_gap(self) -> float:
+        """Its standard deviation."""
+        return self.fit.gap_std if self.fit else nan
 
     @property
     def reasons(self) -> tuple[str, ...]:
@@ -131,5 +139,5 @@ def _fitted(setup: explanations.Setup, v: Array, y: Array, bounds: Bounds | None
         (f'y moves against v: m would be {values[0]:.4g}',) if sign < 0.0 else (),
         tuple(f'{name} would be {value:.4g}, outside [{low:g}, {high:g}]'
               for name, value, (low, high) in outside),
-        dict(zip(('m', 'c_r', 'c_l'), zip(values, stds, strict=True), strict=True)), fit.gap,
-        fit.gap_std, fit, 1.0 - fit.left.rms / max(float(np.nanstd(record.y)), 1e-300), reversals)
+        dict(zip(('m', 'c_r', 'c_l'), zip(values, stds, strict=True), strict=True)),
+        fit, 1.0 - fit.left.rms / max(float(np.nanstd(record.y)), 1e-300), reversals)
