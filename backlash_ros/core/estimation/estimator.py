@@ -270,10 +270,11 @@ class MovingHorizon(Law):
     def _publish(self, known: Known) -> None:
         m, c_r, c_l = self._setup.bounds.project(*known.crossings.tolist())
         std_m, std_c_r, std_c_l = np.sqrt(np.maximum(np.diag(known.cov), 0.0)).tolist()
-        if self._belief.coasts:
+        explained = self._belief.fit or self._belief.found
+        if self._belief.coasts and explained is not None:
             # Motion of the load within the gap makes the gap doubtful: a structure that shrinks it
-            # by its deviations pushes the load less.
-            doubt = 0.5 * self.report.unexplained * (c_r - c_l)
+            # by its deviations pushes the load less. A fit of its own may have next to no gap.
+            doubt = 0.5 * explained.unexplained * explained.gap
             std_c_r, std_c_l = hypot(std_c_r, doubt), hypot(std_c_l, doubt)
         e = self.estimate
         self.estimate = Estimate(m, c_r, c_l, e.f, std_m, std_c_r, std_c_l, e.status)
