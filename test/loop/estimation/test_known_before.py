@@ -118,7 +118,8 @@ def test_a_load_that_coasts_is_named_and_its_crossings_are_in_doubt() -> None:
     assert estimator.estimate.status is Status.INCONSISTENT
     assert estimator.report.coasts
     assert estimator.estimate.c_r == pytest.approx(0.5, abs=0.01)
-    assert estimator.estimate.std_c_r > 0.1
+    # By half of the motion that nothing explains, not by a share of the little gap of its own fit.
+    assert 0.03 < estimator.estimate.std_c_r < 0.1
 
 
 def test_friction_that_stops_the_load_is_backlash() -> None:
