@@ -227,13 +227,17 @@ class ControllerNode(ManagedNode):
         self._rivals.begin(active=False)
         self._diagnose()
 
+    @property
+    def _step_s(self) -> float:
+        """Between two commands that end the loop."""
+        return max(self.settings.sample_period, 1e-3)
+
     def _send_last(self, loops: JointLoops) -> None:
         """Send the commands that end all loops; v comes to rest where it takes too long.
 
         So it does at a SIGTERM that comes meanwhile: whoever sends it will kill the process next.
         """
-        told, longest_s, step_s = \
-            time.monotonic(), self.settings.timeout.ramp, max(self.settings.sample_period, 1e-3)
+        told, longest_s, step_s = time.monotonic(), self.settings.timeout.ramp, self._step_s
         deadline, cut_short = told + longest_s, ''
         while loops.send_next():
             if not cut_short:
@@ -370,8 +374,7 @@ class ControllerNode(ManagedNode):
         if loops.give_up_silent():
             if self._ending is None:
                 self._ending = self.create_timer(
-                    max(self.settings.sample_period, 1e-3), self._send_next,
-                    clock=self.steady_clock,
+                    self._step_s, self._send_next, clock=self.steady_clock
                 )
             for joint in self.joints:
                 joint.told = None

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.control.limits import LARGEST_SIGNAL, plausible
+from backlash_ros.core.control.limits import plausible
 from backlash_ros.core.loop.command_history import v_of_intervals
 from backlash_ros.core.loop.sample_counter import UNNUMBERED, SampleCounter
 
@@ -86,8 +86,9 @@ class Sampling(NamedTuple):
         v = self.commanded if self.reported is None else self.reported
         if v is None:
             return None
-        y, values = np.full(len(v), np.nan), self.outputs['value']
-        y[self.numbers] = np.where(np.abs(values) <= LARGEST_SIGNAL, values, np.nan)
+        y = np.full(len(v), np.nan)
+        y[self.numbers] = [value if plausible(value) else np.nan
+                           for value in self.outputs['value'].tolist()]
         known = int(np.argmax(np.isfinite(v)))
         return v[known:], y[known:]
 

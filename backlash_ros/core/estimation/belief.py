@@ -118,6 +118,11 @@ class Belief:
         return State.KNOWN if self.doubt_from is None else State.DOUBTED
 
     @property
+    def newest(self) -> WindowFit | None:
+        """The fit, or that of no use where there is no other one."""
+        return self.fit or self.found
+
+    @property
     def trusted(self) -> bool:
         """Whether the fit explains its samples and is known well enough."""
         return self.state is State.KNOWN and self.reason is not Status.INCONSISTENT

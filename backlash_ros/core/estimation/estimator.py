@@ -148,7 +148,7 @@ class MovingHorizon(Law):
     @property
     def report(self) -> LawReport:
         belief, found = self._belief, self._belief.found
-        fit = belief.fit or found  # that of no use, where there is no other one
+        fit = belief.newest
         return LawReport(
             noise_ratio=nan if belief.fit is None else belief.fit.noise / self._setup.noise_std,
             unexplained=nan if fit is None else fit.unexplained,
@@ -270,11 +270,11 @@ class MovingHorizon(Law):
     def _publish(self, known: Known) -> None:
         m, c_r, c_l = self._setup.bounds.project(*known.crossings.tolist())
         std_m, std_c_r, std_c_l = np.sqrt(np.maximum(np.diag(known.cov), 0.0)).tolist()
-        explained = self._belief.fit or self._belief.found
-        if self._belief.coasts and explained is not None:
+        fit = self._belief.newest
+        if self._belief.coasts and fit is not None:
             # Motion of the load within the gap makes the gap doubtful: a structure that shrinks it
             # by its deviations pushes the load less. A fit of its own may have next to no gap.
-            doubt = 0.5 * explained.unexplained * explained.gap
+            doubt = 0.5 * fit.unexplained * fit.gap
             std_c_r, std_c_l = hypot(std_c_r, doubt), hypot(std_c_l, doubt)
         e = self.estimate
         self.estimate = Estimate(m, c_r, c_l, e.f, std_m, std_c_r, std_c_l, e.status)

@@ -53,12 +53,11 @@ def with_actuator(found: Identification, commands: Array) -> Identification:
                             default=(0.0, off, None), key=lambda one: one[0])
     if actuator is not None and left <= poor * gap:
         return replace(found, actuator=actuator)
-    assert found.verdict is not None
-    return replace(found, fit=(details, found.verdict._replace(remarks=(
+    return found.with_remarks([
         *found.remarks,
         f'applied_control is off control by {left / gap:.0%} of the gap (rms) that no lag '
         'explains, and y will follow worse for it: stay within what the motor can follow',
-    ))))
+    ])
 
 
 def _fitted(

@@ -111,12 +111,9 @@ def identify(
     s = s._replace(samples=samples, best=best, held_out=s.held_out._replace(
         first=part.start + s.held_out.first))
     found = _as_a_gain(_described(s, given, options, units), s, given, options, units)
-    if slow is None or found.fit is None:
-        return found
-    details, verdict = found.fit
-    return replace(found, fit=(details, verdict._replace(remarks=(
+    return found if slow is None else found.with_remarks([
         f'v jumps, and the drive follows by at most {slow / sample_period:.4g} per s: the fit is '
-        'to v limited so, as is control.rate_max in the file', *verdict.remarks))))
+        'to v limited so, as is control.rate_max in the file', *found.remarks])
 
 
 def _why_nothing(v: Array, y: Array, options: Options) -> str:

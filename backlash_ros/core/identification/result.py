@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import inf, nan
 from typing import NamedTuple
 
@@ -147,6 +147,12 @@ class Identification:
     def remarks(self) -> tuple[str, ...]:
         """What to know, a sentence each."""
         return self.verdict.remarks if self.verdict else ()
+
+    def with_remarks(self, remarks: Sequence[str]) -> Identification:
+        """The same with these remarks, where something was fitted."""
+        if self.fit is None:
+            return self
+        return replace(self, fit=(self.fit[0], self.fit[1]._replace(remarks=tuple(remarks))))
 
     @property
     def usable(self) -> bool:

@@ -14,13 +14,13 @@ Array = NDArray[np.float64]
 class DeviationNoise:
     """Standard deviations of x_hat - x*, and of what the gains of a design make of it.
 
-    y_std: of the noise of y, as configured. known: whether that of x_hat is. x_std: of |x_hat|.
-    u_std: of K (x_hat - x*) for every gain of the schedule, and at least K times errors of y of
-    half its noise. ignored: |x_hat - x*| that is left alone. tolerated: that is worth no crossing.
+    known: whether that of x_hat is. x_std: of |x_hat|. u_std: of K (x_hat - x*) for every gain of
+    the schedule, and at least K times errors of y of half its noise y_std, as configured. ignored:
+    |x_hat - x*| that is left alone. tolerated: that is worth no crossing.
     """
 
     def __init__(self, design: TrackingDesign, y_std: float) -> None:
-        self._design, self.y_std = design, y_std
+        self._design = design
         self.known = False
         self.x_std = self.ignored = self.tolerated = 0.0
         self.x_cov: Array | None = None

@@ -93,6 +93,7 @@ class StateFeedback:
         """Use these gains."""
         self._design = design
         self.noise = DeviationNoise(design, self._y_std)
+        self._holding = design.holding  # made here, before a command waits for it
         # Places in the schedule: of the gain that its noise asks for, and of the one in use.
         self._quiet = self._in_use = 0
 
@@ -204,7 +205,7 @@ class StateFeedback:
 
         ahead: u* from this sample on. side: on which v is. turns_in: samples until u* turns.
         """
-        by_state, by_u = self._design.holding[self._in_use]
+        by_state, by_u = self._holding[self._in_use]
         agreed = side * (by_state @ deviation + by_u @ ahead)[:turns_in]
         return side * float(agreed.min(initial=inf))
 

@@ -169,9 +169,10 @@ class IdealTrajectory:
         if (ahead[0] - state.extreme) * state.side > 0.0 and not state.decided:
             state.extreme = ahead[0]
         state.turns_in = turns_in if state.side is before else 0
-        state.furthest = max(ahead, key=lambda u: u * state.side)
-        after = ahead[ahead.index(state.furthest):]
-        if state.turns_in == len(ahead) and min(after, key=lambda u: u * state.side) != ahead[-1]:
+        most, least_of = (max, min) if state.side is Region.RIGHT else (min, max)
+        state.furthest = most(ahead)
+        if state.turns_in == len(ahead) \
+                and least_of(ahead[ahead.index(state.furthest):]) != ahead[-1]:
             # A swing that is no turn, and over: it is not followed there and back.
             state.furthest = ahead[-1]
         return state.side is not before
