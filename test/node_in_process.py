@@ -24,7 +24,7 @@ from std_srvs.srv import SetBool, Trigger
 from waiting import wait_until
 
 from backlash_ros.core.assembly import build_plant, build_reference
-from backlash_ros.core.jobs.executor import Executor
+from backlash_ros.core.jobs import Executor
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.sample_counter import Output
 from backlash_ros.core.parameters import Parameters

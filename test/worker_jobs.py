@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from backlash_ros.core.jobs.executor import ChannelSamples
+from backlash_ros.core.jobs import ChannelSamples
 
 
 def checksum(samples: ChannelSamples, factor: float) -> tuple[int, int, float]:

@@ -15,7 +15,7 @@ from rosbags.interfaces import Connection
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.parameters import ParameterError
 
 
 class RecordingError(RuntimeError):

@@ -25,16 +25,14 @@ from backlash_ros.core.control.tracking.tracking import Tracking
 from backlash_ros.core.estimate import Bounds, Estimate
 from backlash_ros.core.estimates_file import load_estimate
 from backlash_ros.core.estimation.estimator import MovingHorizon, fitted
-from backlash_ros.core.jobs.executor import Executor
+from backlash_ros.core.jobs import Executor
 from backlash_ros.core.law import Law
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.laws.gradient import GradientEstimator
 from backlash_ros.core.laws.input_reconstruction import InputReconstruction
 from backlash_ros.core.laws.lms import NormalisedLms
 from backlash_ros.core.laws.printed_law import PrintedLaw
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.core.parameters.table import BY_NAME, PlantModel
+from backlash_ros.core.parameters import BY_NAME, ParameterError, Parameters, PlantModel
 from backlash_ros.core.plant.four_blocks import FourBlocks, place_poles
 from backlash_ros.core.plant.model_check import check_model, model_warnings
 from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction

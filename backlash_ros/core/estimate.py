@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from math import isnan
 
-from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.parameters import ParameterError
 
 
 class Status(IntEnum):

@@ -9,8 +9,7 @@ from pathlib import Path
 
 from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core.estimate import Estimate, Status
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.parameters import ParameterError, Parameters
 
 NEEDED, DEVIATIONS = ('m', 'c_r', 'c_l', 'f'), ('std_m', 'std_c_r', 'std_c_l')
 

@@ -99,7 +99,7 @@ class Law:
     def refine(self) -> None:
         """Do what the command of this sample need not wait for.
 
-        A law whose fits are made elsewhere (jobs/executor.py) takes up those that are
+        A law whose fits are made elsewhere (jobs.py) takes up those that are
         finished, and submits the one that is due.
         """
 

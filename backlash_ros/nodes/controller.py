@@ -25,15 +25,18 @@ from backlash_ros.core.assembly import (
     warnings_of,
 )
 from backlash_ros.core.control.controller import ControlStep
-from backlash_ros.core.jobs.executor import Executor
-from backlash_ros.core.jobs.worker import WorkerExecutor
+from backlash_ros.core.jobs import Executor, WorkerExecutor
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.diagnosis import Neighbours
-from backlash_ros.core.loop.driver_period import Timing
 from backlash_ros.core.loop.joint_loops import JointLoops
-from backlash_ros.core.loop.sample_counter import UNNUMBERED, Output, SampleCounter, kept_outputs
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.table import CONTROLLER
+from backlash_ros.core.loop.sample_counter import (
+    UNNUMBERED,
+    Output,
+    SampleCounter,
+    Timing,
+    kept_outputs,
+)
+from backlash_ros.core.parameters import CONTROLLER, Parameters
 from backlash_ros.nodes.control.diagnosis import neighbours_of
 from backlash_ros.nodes.control.joint import Joint
 from backlash_ros.nodes.control.publishing import StepPublisher

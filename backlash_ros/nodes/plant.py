@@ -15,8 +15,7 @@ from std_msgs.msg import Float64
 
 from backlash_ros import topics
 from backlash_ros.core.loop.command_history import HeldControl
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.table import PLANT
+from backlash_ros.core.parameters import PLANT, Parameters
 from backlash_ros.core.scenario import build_plant
 from backlash_ros.nodes.runtime import messages
 from backlash_ros.nodes.runtime.executor import PromptExecutor

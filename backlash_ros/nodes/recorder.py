@@ -24,9 +24,9 @@ from backlash_ros import topics
 from backlash_ros.bags.reader import REPAIR_COMMAND
 from backlash_ros.bags.repair import repair_command
 from backlash_ros.bags.writer import Bag, RecordingError
-from backlash_ros.core.loop.finding import Finding, Level
+from backlash_ros.core.loop.diagnosis import Finding, Level
 from backlash_ros.core.loop.sample_counter import UNNUMBERED
-from backlash_ros.core.parameters.table import RECORDER
+from backlash_ros.core.parameters import RECORDER
 from backlash_ros.nodes.runtime import messages
 from backlash_ros.nodes.runtime.driver_io import driver_topics, output_qos
 from backlash_ros.nodes.runtime.executor import PromptExecutor

@@ -16,8 +16,7 @@ from std_msgs.msg import Float64
 from backlash_ros import topics
 from backlash_ros.core.loop.reference_pace import ReferencePace
 from backlash_ros.core.loop.sample_counter import Output, SampleCounter
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.table import REFERENCE_NODE
+from backlash_ros.core.parameters import REFERENCE_NODE, Parameters
 from backlash_ros.core.reference.signal import PERIODIC
 from backlash_ros.core.scenario import build_reference
 from backlash_ros.nodes.runtime import messages

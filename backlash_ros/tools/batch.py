@@ -20,9 +20,7 @@ import numpy as np
 import yaml
 from tqdm import tqdm
 
-from backlash_ros.core.parameters import Parameters, check_names, check_value
-from backlash_ros.core.parameters.parameter import Value
-from backlash_ros.core.parameters.table import BY_NAME
+from backlash_ros.core.parameters import BY_NAME, Parameters, Value, check_names, check_value
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.metrics import SETTLING_TOLERANCE
 from backlash_ros.tools.cli import (

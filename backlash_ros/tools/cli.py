@@ -13,8 +13,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, NamedTuple
 
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.parameters import ParameterError, Parameters
 from backlash_ros.options import BAD_INPUT, DONE, FAILED
 from backlash_ros.tools.records.columns import parse_columns
 

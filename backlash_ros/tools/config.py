@@ -15,11 +15,18 @@ from typing import Any, NamedTuple
 import yaml
 
 from backlash_ros.atomic_file import write_atomically
-from backlash_ros.core.parameters import Parameters, check_names, check_value
-from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.core.parameters.parameter import Value
-from backlash_ros.core.parameters.parameter_set import entry_of
-from backlash_ros.core.parameters.table import BRINGUP, BY_NAME, CONTROLLER, NODES
+from backlash_ros.core.parameters import (
+    BRINGUP,
+    BY_NAME,
+    CONTROLLER,
+    NODES,
+    ParameterError,
+    Parameters,
+    Value,
+    check_names,
+    check_value,
+    entry_of,
+)
 from backlash_ros.shipped import find_config
 from backlash_ros.tools.cli import InputError
 

@@ -17,9 +17,7 @@ from tqdm import tqdm
 from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.loop.command_history import report_use
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.core.parameters.parameter import as_yaml
+from backlash_ros.core.parameters import ParameterError, Parameters, as_yaml
 from backlash_ros.core.simulation.replay import parting, replay
 from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.options import OptionParser

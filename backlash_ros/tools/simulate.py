@@ -12,9 +12,8 @@ from tqdm import tqdm
 
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.loop.diagnosis import Learning, LoopFigures, Neighbours, state_beside
-from backlash_ros.core.loop.driver_period import Timing
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.parameter import Value, as_yaml
+from backlash_ros.core.loop.sample_counter import Timing
+from backlash_ros.core.parameters import Parameters, Value, as_yaml
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.options import OptionParser
 from backlash_ros.tools import batch, cli

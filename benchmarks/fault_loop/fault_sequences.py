@@ -16,8 +16,7 @@ from backlash_ros.core.control.limits import Limits
 from backlash_ros.core.control.paper_structure import LARGEST_F_OVER_M
 from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.estimates_file import was_given
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.parameters import ParameterError, Parameters
 from backlash_ros.core.plant.transfer_function import TransferFunction
 
 SAMPLES = (300, 800)

@@ -23,9 +23,7 @@ from backlash_ros.core.identification.actuator import with_actuator
 from backlash_ros.core.identification.identification import identify
 from backlash_ros.core.identification.motion import strokes
 from backlash_ros.core.identification.result import Identification, Options
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.core.parameters.parameter import Value
+from backlash_ros.core.parameters import ParameterError, Parameters, Value
 from backlash_ros.tools.identify.identified_file import as_estimate, identified_parameters
 
 Motion = Callable[[float], float]  # of the phase [rad], between -1 and 1

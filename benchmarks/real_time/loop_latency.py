@@ -18,8 +18,7 @@ from std_msgs.msg import Float64
 
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_plant, build_reference
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.table import BY_NAME, CONTROLLER
+from backlash_ros.core.parameters import BY_NAME, CONTROLLER, Parameters
 
 RATES_HZ = (100.0, 1000.0)
 LOOPS = (('moving_horizon', 'proportional'), ('moving_horizon', 'tracking'),

@@ -14,9 +14,7 @@ from reporting import markdown_table as markdown
 
 from backlash_ros.core.assembly import build_model, build_true_model
 from backlash_ros.core.estimate import Status
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.parameter import Parameter, as_yaml
-from backlash_ros.core.parameters.table import BY_NAME
+from backlash_ros.core.parameters import BY_NAME, Parameter, Parameters, as_yaml
 from backlash_ros.core.plant.transfer_function import TransferFunction
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.metrics import control_error_rms, settling_time

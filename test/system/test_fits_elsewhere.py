@@ -11,7 +11,7 @@ from drivers.paced_driver import controller_and_driver
 from ros_processes import NodeProcess, ros_world
 from waiting import wait_until
 
-from backlash_ros.core.jobs import worker
+from backlash_ros.core import jobs
 
 KILLED = 3  # times
 UNCERTAIN: dict[str, object] = {'plant.uncertainty': 0.2}
@@ -22,7 +22,7 @@ def workers_of(controller: NodeProcess) -> list[int]:
     found = []
     for child in psutil.Process(controller.process.pid).children():
         with suppress(psutil.Error):  # it has ended meanwhile
-            if worker.__name__ in ' '.join(child.cmdline()):
+            if jobs.__name__ in ' '.join(child.cmdline()):
                 found.append(child.pid)
     return found
 

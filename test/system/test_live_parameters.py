@@ -11,7 +11,7 @@ from ros_processes import Probe, ros_world
 from std_msgs.msg import Float64, Float64MultiArray
 
 from backlash_ros import topics
-from backlash_ros.core.parameters.table import BY_NAME
+from backlash_ros.core.parameters import BY_NAME
 
 
 class Client:

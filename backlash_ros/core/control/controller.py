@@ -14,7 +14,7 @@ from backlash_ros.core.control.protocol import ControlInput, ControlStructure
 from backlash_ros.core.control.redesign import Redesign
 from backlash_ros.core.control.serial_plant import SerialPlant
 from backlash_ros.core.estimate import Estimate
-from backlash_ros.core.jobs.executor import Executor
+from backlash_ros.core.jobs import Executor
 from backlash_ros.core.law import Interval, Law, StateSource
 
 # Lost outputs in a row that are stepped over; after more nothing is left to predict from them.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import inf, nan
 
-from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.parameters import ParameterError
 from backlash_ros.core.plant.backlash import Region, clamp
 
 

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from math import floor, inf, isnan, sqrt
 from typing import NamedTuple
 
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.parameters import ParameterError, Parameters
 
 LARGEST_SIGNAL = 1e12  # no unit makes a measurement larger; squares of it still are numbers
 

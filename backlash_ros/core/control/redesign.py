@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from backlash_ros.core.control.protocol import ControlStructure
 from backlash_ros.core.control.serial_plant import SerialPlant
-from backlash_ros.core.jobs.executor import LOST, Channel, Executor, Failure
+from backlash_ros.core.jobs import LOST, Channel, Executor, Failure
 from backlash_ros.core.plant.transfer_function import StateModel
 
 # Samples after which a better design takes over though v crosses the gap: an unstable loop never

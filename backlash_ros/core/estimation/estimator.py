@@ -24,7 +24,7 @@ from backlash_ros.core.estimation.observer import Following, Gain, Place, gains_
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.settings import FEWEST, FIRST_FIT, HELD_REVERSALS, LONGEST
 from backlash_ros.core.estimation.state_machine import learn
-from backlash_ros.core.jobs.executor import ChannelSamples, Executor, Failure
+from backlash_ros.core.jobs import ChannelSamples, Executor, Failure
 from backlash_ros.core.law import Interval, Law, LawReport
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.parameters import Parameters

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.identification.result import Identification
-from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.parameters import ParameterError
 from backlash_ros.core.plant.actuator import Actuator
 from backlash_ros.core.plant.numerics import lfilter
 from backlash_ros.core.plant.transfer_function import TransferFunction

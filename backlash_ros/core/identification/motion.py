@@ -11,8 +11,7 @@ from itertools import count
 from math import inf, pi, sin
 
 from backlash_ros.core.control.limits import Limits, at_rest, last_commands
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.parameters import ParameterError, Parameters
 
 # Lowest and highest v, its speed [v/s], sample period [s], duration [s] and first v to its v(k).
 Shape = Callable[[float, float, float, float, float, float], Iterator[float]]

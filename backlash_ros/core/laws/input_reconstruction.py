@@ -15,7 +15,7 @@ from math import inf, nan, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.parameters import ParameterError
 from backlash_ros.core.plant.model_check import check_model
 from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from enum import Enum
 from math import isfinite, nan
 from typing import NamedTuple
 
@@ -17,12 +18,50 @@ from backlash_ros.core.assembly import (
 from backlash_ros.core.control.controller import LONGEST_GAP, ControlStep
 from backlash_ros.core.control.limits import Motion, at_rest, last_commands, plausible
 from backlash_ros.core.estimate import Estimate, Status
-from backlash_ros.core.jobs.executor import Executor
+from backlash_ros.core.jobs import Executor
 from backlash_ros.core.loop.command_history import CommandHistory, report_use
 from backlash_ros.core.loop.loop_statistics import LoopStatistics
-from backlash_ros.core.loop.phase import Event, Phase, after
 from backlash_ros.core.loop.sample_counter import NEXT_SAMPLE, Arrival, Output, SampleCounter
 from backlash_ros.core.parameters import NOISE, Parameters
+
+
+class Phase(Enum):
+    """Where a loop stands."""
+
+    BEGINS = 'begins'
+    RUNS = 'runs'
+    SILENT = 'silent'
+    STANDS_DOWN = 'stands down'
+
+
+class Event(Enum):
+    """What happens to a loop."""
+
+    ANSWER = 'answer'  # y and y_m are there, and which v acts, or nobody is going to say it
+    # An output after a silence, a restart of the driver, or more lost samples than can be stepped
+    # over; while the loop runs, a reset of the estimates or an activation as well.
+    INTERRUPTION = 'interruption'
+    TIMEOUT = 'timeout'  # no output for timeout.plant_output
+    RIVAL = 'rival'  # another controller was first
+    RIVAL_GONE = 'rival gone'
+
+
+NEXT: dict[tuple[Phase, Event], Phase] = {
+    (Phase.BEGINS, Event.ANSWER): Phase.RUNS,  # from the v that acts
+    (Phase.BEGINS, Event.TIMEOUT): Phase.SILENT,  # with the commands of on_timeout
+    (Phase.BEGINS, Event.RIVAL): Phase.STANDS_DOWN,  # the commands of the rival tell which v acts
+    (Phase.RUNS, Event.INTERRUPTION): Phase.BEGINS,  # the state of the plant is unknown
+    (Phase.RUNS, Event.TIMEOUT): Phase.SILENT,
+    (Phase.RUNS, Event.RIVAL): Phase.STANDS_DOWN,
+    (Phase.SILENT, Event.INTERRUPTION): Phase.BEGINS,  # the driver is back
+    (Phase.SILENT, Event.RIVAL): Phase.STANDS_DOWN,
+    (Phase.STANDS_DOWN, Event.RIVAL_GONE): Phase.BEGINS,  # from the newest v that was heard
+}
+
+
+def after(phase: Phase, event: Event) -> Phase:
+    """The phase that follows."""
+    return NEXT.get((phase, event), phase)
 
 
 class Driver(NamedTuple):
@@ -108,6 +147,11 @@ class ControlLoop:
     def begins(self) -> bool:
         """Whether the next command is the first one, since the start or an interruption."""
         return self.phase in (Phase.BEGINS, Phase.SILENT)
+
+    @property
+    def silent(self) -> bool:
+        """Whether the driver is."""
+        return self.phase is Phase.SILENT
 
     @property
     def standing_down(self) -> bool:

@@ -2,20 +2,76 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from enum import IntEnum
 from math import inf, isfinite, nan
-from typing import Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.estimates_file import was_given
 from backlash_ros.core.law import LawReport, OutOfBounds
-from backlash_ros.core.loop.control_loop import ControlLoop
-from backlash_ros.core.loop.driver_period import Timing
-from backlash_ros.core.loop.finding import Finding, Level
 from backlash_ros.core.loop.loop_statistics import Counts
-from backlash_ros.core.loop.phase import Phase
+from backlash_ros.core.loop.sample_counter import Timing
 from backlash_ros.core.parameters import Parameters
+
+if TYPE_CHECKING:
+    from backlash_ros.core.loop.control_loop import ControlLoop
+
+# What passes by itself as a rule is told only after so long: at the third of the looks, which come
+# once a second, be it a little early.
+LASTS_S = 1.5
+AGAIN_S = 10.0  # until the same cause is told once more
+
+
+class Level(IntEnum):
+    """How bad it is, in the numbers of diagnostic_msgs/DiagnosticStatus."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
+
+
+class Finding(NamedTuple):
+    """One line of what goes on. kind: the same word for the same cause, whatever its figures.
+
+    lasting: worth a line of the log only once it has lasted, as it passes by itself as a rule.
+    """
+
+    level: Level
+    kind: str
+    text: str
+    lasting: bool = False
+
+
+class LevelLog:
+    """Writes one line when the level or the cause changes, and one when all is well again.
+
+    What comes and goes is told once: that it is well again only after it has been so for LASTS_S,
+    and the same cause again only after AGAIN_S.
+    """
+
+    def __init__(self, write: Callable[[Level, str], None]) -> None:
+        self._write = write
+        self._told: tuple[Level, str] | None = None  # the newest line, None if all is well
+        self._told_at: dict[tuple[Level, str], float] = {}  # [s]
+        self._seen, self._seen_since = (Level.OK, ''), -inf
+
+    def take(self, finding: Finding, now_s: float) -> None:
+        """Take in what is published in /diagnostics now."""
+        key = (finding.level, finding.kind if finding.level != Level.OK else '')
+        if key != self._seen:
+            self._seen, self._seen_since = key, now_s
+        lasted = now_s - self._seen_since >= LASTS_S
+        if finding.level == Level.OK:
+            if self._told is not None and lasted:
+                self._told = None
+                self._write(Level.OK, f'well again: {finding.text}')
+        elif (lasted or not finding.lasting) and key != self._told \
+                and now_s >= self._told_at.get(key, -inf) + AGAIN_S:
+            self._told, self._told_at[key] = key, now_s
+            self._write(finding.level, finding.text)
+
 
 LONGEST_TEXT = 99  # `ros2 topic echo` cuts off at 128, and a terminal line holds more besides
 # Share of late, lost or bad samples from which on the loop is told to suffer from them.
@@ -155,7 +211,7 @@ def figures_of_loop(
             statistics.inconsistent * p.sample_period, law.adapting, was_given(estimate),
         ),
         standing_down=loop.standing_down,
-        silent_s=p.timeout.plant_output if loop.phase is Phase.SILENT else 0.0,
+        silent_s=p.timeout.plant_output if loop.silent else 0.0,
         on_timeout=p.on_timeout,
         reference_silent_s=inf if not isfinite(loop.heard.y_m)
         else timeout if not may_be_silent and 0.0 < timeout < loop.unreferred_s else 0.0,

@@ -9,9 +9,8 @@ from math import isfinite
 
 from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.estimate import Estimate
-from backlash_ros.core.jobs.executor import Executor
-from backlash_ros.core.loop.control_loop import ControlLoop, Driver
-from backlash_ros.core.loop.phase import Phase
+from backlash_ros.core.jobs import Executor
+from backlash_ros.core.loop.control_loop import ControlLoop, Driver, Phase
 from backlash_ros.core.loop.sample_counter import Output, SampleCounter
 from backlash_ros.core.parameters import Parameters
 

@@ -9,7 +9,17 @@ from functools import partial
 from math import inf, isfinite, isinf, isnan
 from typing import Any, TypeVar, get_args, get_type_hints
 
-from backlash_ros.core.parameters.errors import ParameterError
+UNTOLD = object()  # in place of a value that has nothing to do with the error
+
+
+class ParameterError(ValueError):
+    """A parameter breaks a rule: the message names it, its value, the rule and the cure."""
+
+    def __init__(self, name: str, value: object, rule: str, cure: str = '') -> None:
+        self.name = name
+        message = f'{name} {rule}' if value is UNTOLD else f'{name}={value!r} {rule}'
+        super().__init__(f'{message}: {cure}' if cure else message)
+
 
 Value = bool | int | float | str | tuple[float, ...] | tuple[str, ...]
 Group = TypeVar('Group')

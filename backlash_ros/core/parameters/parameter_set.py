@@ -7,9 +7,10 @@ from collections.abc import Iterable, Iterator, Mapping
 from math import hypot, sqrt
 from pathlib import PurePath
 
-from backlash_ros.core.parameters.errors import UNTOLD, ParameterError
 from backlash_ros.core.parameters.parameter import (
+    UNTOLD,
     Parameter,
+    ParameterError,
     Value,
     check_value,
     filled,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.parameters import ParameterError
 from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
 
 ON_CIRCLE = 1e-6  # distance from the unit circle, from 0, or between two roots, that is none

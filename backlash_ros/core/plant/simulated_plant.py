@@ -21,8 +21,7 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.parameters import ParameterError, Parameters
 from backlash_ros.core.plant.actuator import Actuator, Motor
 from backlash_ros.core.plant.backlash import Backlash
 from backlash_ros.core.plant.transfer_function import TransferFunction

@@ -6,8 +6,7 @@ import csv
 from math import asin, floor, isfinite, pi, sin
 from pathlib import Path
 
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.parameters import ParameterError, Parameters
 
 # Shapes of the phase alone, which go on where they are if the frequency changes.
 PERIODIC = ('sine', 'square', 'triangle', 'multisine')

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from backlash_ros.core.assembly import build_controller
 from backlash_ros.core.control.controller import LONGEST_GAP
 from backlash_ros.core.control.limits import plausible
-from backlash_ros.core.loop.command_history import ReportTrust, report_use
+from backlash_ros.core.loop.command_history import ReportOrigin, ReportTrust, report_use
 from backlash_ros.core.loop.learned_model import learned_model_of
-from backlash_ros.core.loop.report_origin import ReportOrigin
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord, row_of
 

@@ -10,9 +10,15 @@ from rclpy.qos import QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from backlash_ros.core.loop.control_loop import ControlLoop
-from backlash_ros.core.loop.diagnosis import LONGEST_TEXT, Neighbours, Peer, TopicFigures
-from backlash_ros.core.loop.driver_period import Timing
-from backlash_ros.core.loop.finding import Finding, Level
+from backlash_ros.core.loop.diagnosis import (
+    LONGEST_TEXT,
+    Finding,
+    Level,
+    Neighbours,
+    Peer,
+    TopicFigures,
+)
+from backlash_ros.core.loop.sample_counter import Timing
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.run_record import stated_deviations
 from backlash_ros.nodes.control.rivals import name_of

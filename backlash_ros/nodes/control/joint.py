@@ -16,15 +16,15 @@ from backlash_ros.core.estimates_file import save_estimate, worth_saving
 from backlash_ros.core.loop.control_loop import ControlLoop, Driver
 from backlash_ros.core.loop.diagnosis import (
     OF_MESSAGES,
+    Finding,
+    Level,
     Neighbours,
     figures_of_loop,
     findings_of,
 )
-from backlash_ros.core.loop.driver_period import Timing
-from backlash_ros.core.loop.finding import Finding, Level
 from backlash_ros.core.loop.loop_statistics import Lately
-from backlash_ros.core.parameters import NOISE, Parameters
-from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.loop.sample_counter import Timing
+from backlash_ros.core.parameters import NOISE, ParameterError, Parameters
 from backlash_ros.nodes.control.diagnosis import counts_of, details_of, missing_joint, values_of
 from backlash_ros.nodes.control.publishing import ModelPublisher
 from backlash_ros.nodes.runtime.driver_io import DriverIo

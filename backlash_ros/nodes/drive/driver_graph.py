@@ -12,7 +12,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from backlash_ros import topics
 from backlash_ros.core.driver_check.heard import Graph
 from backlash_ros.core.driver_check.verdict import FLOAT64
-from backlash_ros.core.parameters.table import RECORDER
+from backlash_ros.core.parameters import RECORDER
 from backlash_ros.nodes.control.rivals import names_of
 from backlash_ros.nodes.runtime.messages import DEPTH
 

@@ -18,7 +18,7 @@ from backlash_ros.core.assembly import build_controller, build_limits
 from backlash_ros.core.control.limits import plausible
 from backlash_ros.core.driver_check.heard import Heard, Message
 from backlash_ros.core.identification.motion import Drive, Shape, drive_limits
-from backlash_ros.core.parameters.table import CONTROLLER
+from backlash_ros.core.parameters import CONTROLLER
 from backlash_ros.nodes.control.rivals import Presence, identity_made_by
 from backlash_ros.nodes.drive.driver_graph import DriverGraph
 from backlash_ros.nodes.runtime.executor import PromptExecutor

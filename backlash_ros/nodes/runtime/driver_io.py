@@ -16,10 +16,8 @@ from std_msgs.msg import Float64, Float64MultiArray
 
 from backlash_ros import topics
 from backlash_ros.core.loop.command_history import KEPT_COMMANDS
-from backlash_ros.core.loop.driver_period import Timing
-from backlash_ros.core.loop.sample_counter import Output
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.loop.sample_counter import Output, Timing
+from backlash_ros.core.parameters import ParameterError, Parameters
 from backlash_ros.nodes.runtime.executor import serve_polled
 from backlash_ros.nodes.runtime.messages import DEPTH
 from backlash_ros.nodes.runtime.process import ProcessNode

@@ -15,7 +15,7 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 
 from backlash_ros import topics
-from backlash_ros.core.loop.finding import Finding, Level, LevelLog
+from backlash_ros.core.loop.diagnosis import Finding, Level, LevelLog
 
 # Deep enough that a recorder which is held up for a second misses nothing.
 DEPTH = 1000

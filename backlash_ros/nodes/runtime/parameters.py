@@ -13,11 +13,17 @@ from rcl_interfaces import msg
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
-from backlash_ros.core.parameters import Parameters, check_value
-from backlash_ros.core.parameters.errors import UNTOLD, ParameterError
-from backlash_ros.core.parameters.parameter import Parameter, Value
-from backlash_ros.core.parameters.parameter_set import entry_of
-from backlash_ros.core.parameters.table import BY_NAME, CONTROLLER
+from backlash_ros.core.parameters import (
+    BY_NAME,
+    CONTROLLER,
+    UNTOLD,
+    Parameter,
+    ParameterError,
+    Parameters,
+    Value,
+    check_value,
+    entry_of,
+)
 
 
 class ParameterNode(Node):

@@ -28,9 +28,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 from rclpy.utilities import remove_ros_args
 
-from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.core.parameters.parameter import as_yaml
-from backlash_ros.core.parameters.table import BY_NAME
+from backlash_ros.core.parameters import BY_NAME, ParameterError, as_yaml
 from backlash_ros.middleware.loopback import prefer_loopback
 from backlash_ros.nodes.runtime.executor import Polled, PromptExecutor
 from backlash_ros.nodes.runtime.parameters import ParameterNode, complaints, declare_parameters

@@ -11,8 +11,7 @@ from math import inf
 from pathlib import Path
 
 from backlash_ros.core.assembly import build_controller, build_plant, build_reference
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.parameters import ParameterError, Parameters
 from backlash_ros.middleware.installed import ROS_MISSING, ros_is_missing
 from backlash_ros.tools.bringup.environment import child_environment, foreign_environment
 from backlash_ros.tools.bringup.supervisor import Child

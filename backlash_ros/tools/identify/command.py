@@ -8,7 +8,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from backlash_ros.core.parameters.parameter import Value
+from backlash_ros.core.parameters import Value
 from backlash_ros.options import FAILED, OptionParser, add_motion_options, positive
 from backlash_ros.tools.cli import add_options, run_tool, span_of
 

@@ -23,8 +23,7 @@ from tqdm import tqdm
 
 from backlash_ros import topics
 from backlash_ros.core.identification.result import Identification
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.parameter import Value
+from backlash_ros.core.parameters import Parameters, Value
 from backlash_ros.core.records.record import Record, RecordError
 from backlash_ros.middleware.installed import ROS_MISSING, ros_is_missing
 from backlash_ros.options import BAD_INPUT

@@ -11,9 +11,7 @@ import numpy as np
 from backlash_ros.core.assembly import build_controller, first_guess
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.identification.result import Details, Identification
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.parameter import Value
-from backlash_ros.core.parameters.table import BRINGUP, BY_NAME, PLANT
+from backlash_ros.core.parameters import BRINGUP, BY_NAME, PLANT, Parameters, Value
 from backlash_ros.tools.config import ANY, config_text
 
 

@@ -18,8 +18,7 @@ from backlash_ros.core.estimates_file import save_estimate
 from backlash_ros.core.identification.actuator import with_actuator
 from backlash_ros.core.identification.identification import identify
 from backlash_ros.core.identification.result import Identification, Options
-from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.core.parameters.parameter import Value
+from backlash_ros.core.parameters import ParameterError, Value
 from backlash_ros.core.records.record import Record
 from backlash_ros.tools.cli import BrokenOffError, format_table
 from backlash_ros.tools.identify.identified_file import (

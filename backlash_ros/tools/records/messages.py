@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros import topics
-from backlash_ros.core.loop.command_history import REPORTED
+from backlash_ros.core.loop.command_history import REPORTED, without_origin
 from backlash_ros.core.loop.diagnosis import TROUBLE
-from backlash_ros.core.loop.report_origin import without_origin
 from backlash_ros.core.records.record import Record, RecordError
 from backlash_ros.core.records.rows_to_record import readings, usable
 from backlash_ros.core.records.stamps import in_order

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.assembly import LAWS, build_structure, first_guess, law_fits
 from backlash_ros.core.estimate import Status
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.parameters import ParameterError, Parameters
 from backlash_ros.core.plant.backlash import Backlash
 from backlash_ros.core.reference.signal import PERIODIC
 from backlash_ros.core.simulation import metrics

@@ -12,8 +12,7 @@ from backlash_ros.core.assembly import LAWS, STRUCTURES, build_controller, law_f
 from backlash_ros.core.control.paper_structure import LARGEST_F_OVER_M
 from backlash_ros.core.control.protocol import LARGEST_FEEDBACK
 from backlash_ros.core.estimates_file import was_given
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.parameters import ParameterError, Parameters
 
 DOCS = ROOT / 'docs'
 PAIRS = [(law, structure) for structure in STRUCTURES for law in LAWS]

@@ -11,7 +11,7 @@ from lifecycle_msgs.msg import Transition
 from node_in_process import Bench, bench, look_for_silence
 from std_srvs.srv import Trigger
 
-from backlash_ros.core.loop.phase import Phase
+from backlash_ros.core.loop.control_loop import Phase
 
 RATE_MAX = 400.0
 STEP = RATE_MAX * 0.01 * (1.0 + 1e-9)

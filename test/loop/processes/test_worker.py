@@ -18,15 +18,14 @@ from places import ROOT
 from waiting import wait_until
 from worker_jobs import checksum, foreign_modules, last_for_ever
 
-from backlash_ros.core.jobs.executor import LOST, Channel, ChannelSamples, Failure
-from backlash_ros.core.jobs.worker import WorkerExecutor
+from backlash_ros.core.jobs import LOST, Channel, ChannelSamples, Failure, WorkerExecutor
 
 KILLED = 3  # times
 PARENT = f"""
 import sys, time
 sys.path[:0] = [{str(ROOT)!r}, {str(ROOT / 'test')!r}]
 from pathlib import Path
-from backlash_ros.core.jobs.worker import WorkerExecutor
+from backlash_ros.core.jobs import WorkerExecutor
 from worker_jobs import last_for_ever
 executor = WorkerExecutor()
 channel = executor.open()

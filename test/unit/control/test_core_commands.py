@@ -12,8 +12,7 @@ from strategies import plays, signals, usual_plays
 from backlash_ros.core.assembly import build_controller
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.limits import LARGEST_SIGNAL, Limits, at_rest, last_commands
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.parameters import ParameterError, Parameters
 from backlash_ros.core.plant.backlash import Backlash
 
 

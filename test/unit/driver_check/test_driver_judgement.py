@@ -26,8 +26,7 @@ from backlash_ros.core.control.limits import Limits
 from backlash_ros.core.driver_check.heard import Heard, Message
 from backlash_ros.core.driver_check.verdict import FLOAT64, UNKNOWN, all_fit, judge, table
 from backlash_ros.core.identification.motion import Drive, drive_limits, strokes, waves
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.parameters import ParameterError, Parameters
 from backlash_ros.core.plant.transfer_function import TransferFunction
 from backlash_ros.nodes.drive.driver_graph import similar_topics
 

@@ -14,8 +14,7 @@ from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.estimates_file import load_estimate, save_estimate, worth_saving
 from backlash_ros.core.loop.control_loop import ControlLoop, Driver
 from backlash_ros.core.loop.sample_counter import SampleCounter
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.parameters import ParameterError, Parameters
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.replay import replay
 from backlash_ros.tools.runs.summary import summarise

@@ -12,7 +12,9 @@ from backlash_ros.core.law import LawReport, OutOfBounds
 from backlash_ros.core.loop.diagnosis import (
     LONGEST_TEXT,
     UNNAMED,
+    Finding,
     Learning,
+    Level,
     LoopFigures,
     Neighbours,
     Peer,
@@ -20,8 +22,7 @@ from backlash_ros.core.loop.diagnosis import (
     causes_of,
     findings_of,
 )
-from backlash_ros.core.loop.driver_period import Period, Timing
-from backlash_ros.core.loop.finding import Finding, Level
+from backlash_ros.core.loop.sample_counter import Period, Timing
 
 DRIVER, OTHER = Peer('/driver', 'Float64'), Peer('/other', 'Float64')
 WELL = LoopFigures(

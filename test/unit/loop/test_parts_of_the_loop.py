@@ -7,12 +7,11 @@ from math import isnan
 import numpy as np
 import pytest
 
-from backlash_ros.core.loop.driver_period import DriverPeriod
-from backlash_ros.core.loop.finding import AGAIN_S, LASTS_S, Finding, Level, LevelLog
+from backlash_ros.core.loop.control_loop import Event, Phase, after
+from backlash_ros.core.loop.diagnosis import AGAIN_S, LASTS_S, Finding, Level, LevelLog
 from backlash_ros.core.loop.loop_statistics import Lately, LoopStatistics
-from backlash_ros.core.loop.phase import Event, Phase, after
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.loop.sample_counter import DriverPeriod
+from backlash_ros.core.parameters import ParameterError, Parameters
 
 
 @pytest.mark.parametrize(('phase', 'event'), list(product(Phase, Event)))

@@ -11,10 +11,10 @@ from backlash_ros.core.loop.command_history import (
     CONSISTENT,
     CommandHistory,
     HeldControl,
+    ReportOrigin,
     report_use,
     v_of_intervals,
 )
-from backlash_ros.core.loop.report_origin import ReportOrigin
 from backlash_ros.core.loop.sample_counter import UNNUMBERED, Arrival, SampleCounter
 from backlash_ros.core.parameters import Parameters
 

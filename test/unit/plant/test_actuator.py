@@ -7,8 +7,7 @@ import pytest
 
 from backlash_ros.core.assembly import build_controller, build_plant, build_reference
 from backlash_ros.core.estimate import Estimate, Status
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.parameters import ParameterError, Parameters
 from backlash_ros.core.plant.actuator import Actuator
 from backlash_ros.core.plant.transfer_function import TransferFunction
 from backlash_ros.core.simulation.closed_loop import build_closed_loop

@@ -14,8 +14,7 @@ from scipy.signal import lfilter as scipy_lfilter
 from strategies import output_of, plants
 
 from backlash_ros.core.assembly import build_controller, takes_model_as_exact, warnings_of
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.parameters import ParameterError, Parameters
 from backlash_ros.core.plant.numerics import lfilter, lyapunov, riccati
 from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
 
@@ -85,7 +84,7 @@ import sys
 import time
 from math import sin
 from backlash_ros.core.assembly import WORKER_MODULES, build_controller, build_plant
-from backlash_ros.core.jobs.worker import WorkerExecutor
+from backlash_ros.core.jobs import WorkerExecutor
 from backlash_ros.core.parameters import Parameters
 p = Parameters({
     'structure': 'tracking', 'output_noise_std': 1e-3, 'sample_period': 0.01,

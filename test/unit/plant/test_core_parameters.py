@@ -7,10 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from backlash_ros.core.assembly import build_controller, build_plant, build_reference
-from backlash_ros.core.parameters import Parameters, check_value
-from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.core.parameters.parameter import Parameter
-from backlash_ros.core.parameters.table import BY_NAME
+from backlash_ros.core.parameters import BY_NAME, Parameter, ParameterError, Parameters, check_value
 
 NUMBERS = [p for p in BY_NAME.values() if isinstance(p.default, (int, float))
            and not isinstance(p.default, bool)]

@@ -13,8 +13,7 @@ from scipy.signal import cont2discrete, lfilter
 from strategies import eighths, output_of, paper_example, plants, signals, usual_plays
 
 from backlash_ros.core.assembly import build_model, build_plant, build_true_model
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.parameters import ParameterError, Parameters
 from backlash_ros.core.plant.backlash import Backlash, Region, clamp, play
 from backlash_ros.core.plant.simulated_plant import SimulatedPlant, altered_plant
 from backlash_ros.core.plant.transfer_function import TransferFunction

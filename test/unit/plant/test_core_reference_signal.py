@@ -7,9 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.core.parameters.table import BY_NAME
+from backlash_ros.core.parameters import BY_NAME, ParameterError, Parameters
 from backlash_ros.core.reference.signal import ReferenceSignal
 
 OMEGA = 2.0 * pi  # a period of one second

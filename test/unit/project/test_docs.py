@@ -16,8 +16,7 @@ from tables import parameters_page
 
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_controller
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.table import BY_NAME
+from backlash_ros.core.parameters import BY_NAME, Parameters
 from backlash_ros.nodes.check_driver import parse_options
 from backlash_ros.tools import batch
 from backlash_ros.tools import compare as compare

@@ -8,8 +8,7 @@ from places import ROOT
 
 from backlash_ros.core.assembly import build_controller
 from backlash_ros.core.estimates_file import load_estimate
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.parameters import ParameterError, Parameters
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.tools.cli import InputError
 from backlash_ros.tools.config import (

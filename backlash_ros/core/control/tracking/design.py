@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from backlash_ros.core.control.tracking.lq_preview import PreviewGains, preview_gains
 from backlash_ros.core.control.tracking.margin import Feedback, modulus_margin, tolerates
 from backlash_ros.core.control.tracking.reference_window import averages
-from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.parameters import ParameterError
 from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction, powers
 
 Array = NDArray[np.float64]

@@ -4,7 +4,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from backlash_ros.core.jobs.executor import ChannelSamples, Executor
+from backlash_ros.core.jobs import ChannelSamples, Executor
 
 
 def everything(samples: ChannelSamples, *more: object) -> tuple[object, ...]:
