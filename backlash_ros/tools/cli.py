@@ -44,7 +44,7 @@ WHOLE_SPAN = Span()
 OPTIONS: dict[str, dict[str, Any]] = {
     '--config': {
         'type': Path, 'metavar': 'FILE', 'help': 'ROS 2 parameter file, or the name of a shipped '
-        "one (default: the paper's example)"},
+        "one (default: parameters.yaml beside a recorded run, else the paper's example)"},
     '--set': {
         'action': 'append', 'default': [], 'metavar': '[AXIS/]KEY=VALUE', 'dest': 'settings',
         'help': 'change one parameter, of all axes or of one; may be given again'},

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import matplotlib.style
 import numpy as np
@@ -21,13 +21,13 @@ from backlash_ros.tools.runs.summary import ErrorCurves, Part, estimated_loop
 from backlash_ros.topics import BACKLASH
 
 Array = NDArray[np.float64]
+Line = tuple[Any, ...]  # what `curve` takes behind the axes: t, values, colour and further ones
 
 TIME_LABEL = 'time t [s]'  # label of an axis
 # Okabe-Ito and Tol: distinct with every kind of colour vision.
 HUES = {
-    'm': '#0072B2', 'c_r': '#D55E00', 'c_l': '#009E73',
-    'u': '#000000', 'u_d': '#E69F00', 'v': '#CC79A7', 'y': '#332288', 'y_m': '#777777',
-    'e': '#882255', 'true': '#000000',
+    'm': '#0072B2', 'c_r': '#D55E00', 'c_l': '#009E73', 'v': '#CC79A7', 'u_d': '#E69F00',
+    'y': '#332288', 'y_m': '#777777', 'u': '#000000', 'e': '#882255', 'true': '#000000',
 }
 HATS = {'m': r'\hat{m}', 'c_r': r'\hat{c}_r', 'c_l': r'\hat{c}_l'}
 LINE_STYLES = {'m': '-', 'c_r': '--', 'c_l': '-.'}
@@ -51,16 +51,14 @@ def png(figure: Figure) -> bytes:
 
 def label(axes: Axes, title: str = '', y: str = '', x: str = '') -> None:
     """Set the title and the labels with units that are given."""
-    axes.set(**{key: text for key, text in (('title', title), ('ylabel', y), ('xlabel', x))
-                if text})
+    texts = {'title': title, 'ylabel': y, 'xlabel': x}
+    axes.set(**{key: text for key, text in texts.items() if text})
 
 
 def legend_above(axes: Axes) -> None:
     """Put the legend in one row above the axes, at the right, beside the title."""
-    axes.legend(
-        loc='lower right', bbox_to_anchor=(1.0, 1.0), ncol=9, borderaxespad=0.1,
-        handlelength=2.2, columnspacing=1.4,
-    )
+    axes.legend(loc='lower right', bbox_to_anchor=(1.0, 1.0), ncol=9, borderaxespad=0.1,
+                handlelength=2.2, columnspacing=1.4)
 
 
 def legend_below(figure: Figure, axes: Axes, columns: int = 4) -> None:
@@ -68,11 +66,11 @@ def legend_below(figure: Figure, axes: Axes, columns: int = 4) -> None:
     figure.legend(*axes.get_legend_handles_labels(), loc='outside lower center', ncol=columns)
 
 
-def limit_decades(axes: Axes, lowest: float, highest: float, decades: float = 8.0) -> None:
-    """Make y logarithmic over at most so many decades: what is below them is as good as zero."""
+def limit_decades(axes: Axes, lowest: float, highest: float) -> None:
+    """Make y logarithmic over at most 8 decades: what is below them is as good as zero."""
     axes.set_yscale('log')
     if 0.0 < highest < np.inf:
-        axes.set_ylim(max(lowest, highest * 10.0**-decades) * 0.6, highest * 1.7)
+        axes.set_ylim(max(lowest, highest * 1e-8) * 0.6, highest * 1.7)
 
 
 def curve(
@@ -91,18 +89,15 @@ def zero_line(axes: Axes) -> None:
 def band(axes: Axes, t: Array, low: Array, high: Array, colour: str, name: str = '') -> None:
     """Fill between two signals over time, where both are known."""
     step = slice(None, None, max(len(t) // 2000, 1))  # the eye resolves no more points
-    axes.fill_between(
-        t[step], low[step], high[step], color=colour, alpha=0.18, linewidth=0, label=name or '_',
-    )
+    axes.fill_between(t[step], low[step], high[step], color=colour, alpha=0.18, linewidth=0,
+                      label=name or '_')
 
 
 def shade(axes: Axes, t: Array, where: NDArray[np.bool_], name: str) -> None:
     """Shade the times for which `where` holds."""
     if where.any():
-        axes.fill_between(
-            t, 0, 1, where=where.tolist(), transform=axes.get_xaxis_transform(), step='post',
-            color='#bbbbbb', alpha=0.4, linewidth=0, label=name,
-        )
+        axes.fill_between(t, 0, 1, where=where.tolist(), transform=axes.get_xaxis_transform(),
+                          step='post', color='#bbbbbb', alpha=0.4, linewidth=0, label=name)
 
 
 def limits(values: Sequence[Array], margin: float) -> tuple[float, float]:
@@ -113,20 +108,8 @@ def limits(values: Sequence[Array], margin: float) -> tuple[float, float]:
     return low - room, high + room
 
 
-class Line(NamedTuple):
-    """One signal of a panel; values and t have shape (N,)."""
-
-    t: Array
-    values: Array
-    colour: str
-    name: str = ''
-    style: str = '-'
-    width: float = 1.3
-    alpha: float = 1.0
-
-
 def draw_panels(
-    height: float, rows: Mapping[str, Sequence[Line]], parts: Sequence[Part],
+    height: float, rows: Mapping[str, Sequence[Line]], parts: Sequence[Part] = (WHOLE_RUN,),
     frozen_in: RunRecord | None = None, **others: Any,
 ) -> tuple[Figure, NDArray[Any]]:
     """A figure whose columns show parts of a run, and its axes, shape (rows, parts).
@@ -141,8 +124,8 @@ def draw_panels(
         label(column[-1], x=TIME_LABEL)
         for axes, (name, lines) in zip(column, rows.items(), strict=True):
             label(axes, y=name if part is parts[0] else '')
-            for line in lines:
-                curve(axes, line.t[part.rows], line.values[part.rows], *line[2:])
+            for t, values, *look in lines:
+                curve(axes, t[part.rows], values[part.rows], *look)
             if frozen_in is not None:
                 frozen = frozen_in.column('status')[part.rows] >= float(Status.NOT_EXCITED)
                 shade(axes, frozen_in.column('t')[part.rows], frozen, 'frozen')
@@ -153,49 +136,43 @@ def draw_parameter_errors(
     run: RunRecord, start: Part, settling: Mapping[str, float | None],
 ) -> Figure:
     """Errors of the estimates over time, as Figure 4 of the paper, and their relative size."""
-    t, parts = run.column('t'), (start, WHOLE_RUN)
-    errors, percents = [], []
+    t, parts, tolerance = run.column('t'), (start, WHOLE_RUN), 100.0 * SETTLING_TOLERANCE
+    errors: list[Line] = []
+    percents: list[Line] = []
     for name in BACKLASH:
         truth, hue, style = run.column(f'true_{name}'), HUES[name], LINE_STYLES[name]
-        unit = BACKLASH_UNITS[name].removeprefix('unit of ')
-        off = truth - run.column(name)
-        errors.append(Line(t, off, hue, f'${name} - {HATS[name]}$ [{unit}]', style, 1.8))
+        error, unit = truth - run.column(name), BACKLASH_UNITS[name].removeprefix('unit of ')
+        errors.append((t, error, hue, f'${name} - {HATS[name]}$ [{unit}]', style, 1.8))
         # Nothing is a percentage of zero, and the logarithm has no zero.
-        size = np.maximum(100.0 * np.abs(off / np.where(truth == 0.0, np.nan, truth)), 1e-300)
-        percents.append(Line(t, size, hue, '', style, 1.5))
+        size = np.maximum(100.0 * np.abs(error / np.where(truth == 0.0, np.nan, truth)), 1e-300)
+        percents.append((t, size, hue, '', style, 1.5))
     figure, grid = draw_panels(7.4, {
         'true minus estimated': errors, 'size of the error [% of the true value]': percents,
     }, parts, run, sharey='row')
-    for (absolute, relative), part in zip(grid.T, parts, strict=True):
-        for name, error in zip(BACKLASH, errors, strict=True):
-            std = 2 * run.column(f'std_{name}')
-            band(absolute, t[part.rows], (error.values - std)[part.rows],
-                 (error.values + std)[part.rows], HUES[name])
-            settled = settling[name]
-            if settled is not None and settled <= t[part.rows][-1]:
-                relative.plot(settled, 100.0 * SETTLING_TOLERANCE, 'o', color=HUES[name],
-                              markersize=7, markeredgecolor='white', zorder=5)
+    for (absolute, relative), (_, rows) in zip(grid.T, parts, strict=True):
+        for name, (_, error, *_) in zip(BACKLASH, errors, strict=True):
+            std, settled = 2 * run.column(f'std_{name}'), settling[name]
+            band(absolute, t[rows], (error - std)[rows], (error + std)[rows], HUES[name])
+            if settled is not None and settled <= t[rows][-1]:
+                relative.plot(settled, tolerance, 'o', color=HUES[name], markersize=7,
+                              markeredgecolor='white', zorder=5)
         zero_line(absolute)
-        absolute.set_ylim(*limits([error.values for error in errors], margin=0.08))
-        relative.axhline(100.0 * SETTLING_TOLERANCE, color='#444444', linewidth=0.9, linestyle=':')
-        known = np.concatenate([line.values[part.rows] for line in percents])
+        absolute.set_ylim(*limits([error for _, error, *_ in errors], margin=0.08))
+        relative.axhline(tolerance, color='#444444', linewidth=0.9, linestyle=':')
+        known = np.concatenate([size[rows] for _, size, *_ in percents])
         known = known[np.isfinite(known)]
-        if known.size:
-            limit_decades(relative, min(float(known.min()), 0.5), max(float(known.max()), 2.0))
+        limit_decades(relative, known.min(initial=0.5), known.max(initial=2.0))
     legend_below(figure, grid[0, 1])
     return figure
 
 
 def draw_estimates(run: RunRecord) -> Figure:
     """Estimates over time with two standard deviations, and the truth where it is known."""
-    t, rows = run.column('t'), {}
-    for name in BACKLASH:
-        truth = [Line(t, run.column(f'true_{name}'), HUES['true'], 'true', '-', 6.0, 0.22)]
-        estimated = Line(t, run.column(name), HUES[name], 'estimated', '-', 1.8)
-        rows[f'${HATS[name]}$ [{BACKLASH_UNITS[name]}]'] = [
-            *(truth if run.has_truth else []), estimated,
-        ]
-    figure, grid = draw_panels(7.0, rows, [WHOLE_RUN], run)
+    t = run.column('t')
+    figure, grid = draw_panels(7.0, {f'${HATS[name]}$ [{BACKLASH_UNITS[name]}]': [
+        *[(t, run.column(f'true_{name}'), HUES['true'], 'true', '-', 6.0, 0.22)] * run.has_truth,
+        (t, run.column(name), HUES[name], 'estimated', '-', 1.8),
+    ] for name in BACKLASH}, frozen_in=run)
     for axes, name in zip(grid[:, 0], BACKLASH, strict=True):
         estimate, std = run.column(name), 2 * run.column(f'std_{name}')
         title = f'${HATS[name]}$ = {estimate[-1]:.6g}'
@@ -213,7 +190,7 @@ def draw_estimates(run: RunRecord) -> Figure:
 def draw_closer(run: RunRecord, values: Array, name: str, parts: Sequence[Part]) -> Figure:
     """A signal over the whole run, and beside it closer over each part."""
     figure, grid = draw_panels(
-        3.6, {name: [Line(run.column('t'), values, HUES['e'])]}, (WHOLE_RUN, *parts), run,
+        3.6, {name: [(run.column('t'), values, HUES['e'])]}, (WHOLE_RUN, *parts), run,
         width_ratios=[2.0, *(1.0 for _ in parts)],
     )
     for axes in grid[0]:
@@ -229,9 +206,9 @@ def draw_hysteresis(run: RunRecord, end: Part) -> Figure:
     u = run.column('u') if truth else estimated_loop(run)
     span = np.array(limits([v[end.rows]], margin=0.15))
     for name, side in (('c_r', 'right'), ('c_l', 'left')):
-        m, c = run.column('m')[-1], run.column(name)[-1]
+        m, c, true_m, true_c = (run.column(column)[-1]
+                                for column in ('m', name, 'true_m', f'true_{name}'))
         if truth:
-            true_m, true_c = run.column('true_m')[-1], run.column(f'true_{name}')[-1]
             curve(axes, span, true_m * (span - true_c), HUES[name],
                   f'true {side} line\n$m(v - {name})$', width=6.0, alpha=0.35)
         curve(axes, span, m * (span - c), HUES[name],
@@ -239,8 +216,7 @@ def draw_hysteresis(run: RunRecord, end: Part) -> Figure:
     axes.plot(v, u, color='#999999', linewidth=0.8, zorder=1, label='earlier')
     axes.plot(v[end.rows], u[end.rows], color=HUES['u'], linewidth=1.1, marker='.',
               markersize=3, label=f'samples from\n{t[0]:.4g} s to {t[-1]:.4g} s')
-    axes.set_xlim(*span)
-    axes.set_ylim(*limits([u[end.rows]], margin=0.25))
+    axes.set(xlim=span, ylim=limits([u[end.rows]], margin=0.25))
     label(axes, 'u = B[v]' if truth else 'u = B[v] as the last estimates see it',
           'u [unit of u]', 'control v [unit of v]')
     axes.legend(loc='upper left', bbox_to_anchor=(1.01, 1.0), labelspacing=1.0)
@@ -251,30 +227,27 @@ def draw_output(run: RunRecord, end: Part, y_m: Array, delay: float, followed: b
     """Reference, `delay` [s] late, and output: on one scale where y follows, else on their own."""
     t, y = run.column('t'), run.column('y')
     late = f', {delay:.4g} s late' if delay else ''
-    rows = {
-        '[unit of y]': [
-            Line(t, y_m, HUES['y_m'], f'$y_m${late}', '--'), Line(t, y, HUES['y'], 'y'),
-        ],
-        'y minus reference [unit of y]': [Line(t, y - y_m, HUES['y'])],
+    reference, output = (t, y_m, HUES['y_m']), (t, y, HUES['y'])
+    figure, grid = draw_panels(5.6, {
+        '[unit of y]': [(*reference, f'$y_m${late}', '--'), (*output, 'y')],
+        'y minus reference [unit of y]': [(t, y - y_m, HUES['y'])],
     } if followed else {
-        f'reference $y_m$ [unit of $y_m$]{late}': [Line(t, y_m, HUES['y_m'])],
-        'output y [unit of y]': [Line(t, y, HUES['y'])],
-    }
-    figure, grid = draw_panels(5.6, rows, (WHOLE_RUN, end))
-    if followed:
-        for axes in grid[0]:
-            legend_above(axes)
+        f'reference $y_m$ [unit of $y_m$]{late}': [reference], 'output y [unit of y]': [output],
+    }, (WHOLE_RUN, end))
+    for axes in grid[0] if followed else ():
+        legend_above(axes)
     return figure
 
 
 def draw_input(run: RunRecord, parts: Sequence[Part]) -> Figure:
     """Desired and true input of G, and the control v that causes it."""
-    t, u = run.column('t'), run.column('u')
-    known = [Line(t, u, HUES['u'], 'u', '-', 1.6)] if np.isfinite(u).any() else []
-    desired = Line(t, run.column('u_d'), HUES['u_d'], '$u_d$', '--' if known else '-', 1.6)
+    t, u, hue = run.column('t'), run.column('u'), HUES['u_d']
+    known = bool(np.isfinite(u).any())
     figure, grid = draw_panels(5.6, {
-        'input of G [unit of u]': [*known, desired],
-        'control v [unit of v]': [Line(t, run.column('v'), HUES['v'])],
+        'input of G [unit of u]': [
+            *[(t, u, HUES['u'], 'u', '-', 1.6)] * known,
+            (t, run.column('u_d'), hue, '$u_d$', '--' if known else '-', 1.6)],
+        'control v [unit of v]': [(t, run.column('v'), HUES['v'])],
     }, parts)
     legend_above(grid[0, -1])
     return figure
@@ -285,28 +258,27 @@ def draw_error_curves(loops: Sequence[ErrorCurves], window_s: float) -> Figure:
 
     window_s: over which the RMS was taken [s].
     """
-    colours = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#332288', '#777777',
-               '#000000')
-    control, tracking = [], []
-    for i, (name, t, of_control, of_tracking) in enumerate(loops):
+    colours = [HUES[name] for name in ('m', 'c_r', 'c_l', 'v', 'u_d', 'y', 'y_m', 'u')]
+    rows: dict[str, list[Line]] = {
+        f'RMS of $u - u_d$ over {window_s:.3g} s\n[unit of u]': [],
+        f'RMS of $y - y_m$ over {window_s:.3g} s\n[unit of y]': [],
+    }
+    for i, (name, t, *errors) in enumerate(loops):
         # The curve of the loop without backlash comes to lie on that of the one that has learned.
         width = 3.4 if name == 'moving_horizon, tracking' else 1.7
-        look = colours[i % len(colours)], name, ('-', '--', '-.', ':')[i % 4], width
-        control.append(Line(t, of_control, *look))
-        if of_tracking is not None:
-            tracking.append(Line(t, of_tracking, *look))
-    rows = {f'RMS of $u - u_d$ over {window_s:.3g} s\n[unit of u]': control}
-    if tracking:
-        rows[f'RMS of $y - y_m$ over {window_s:.3g} s\n[unit of y]'] = tracking
-    figure, grid = draw_panels(4.2 * len(rows), rows, [WHOLE_RUN])
+        for lines, error in zip(rows.values(), errors, strict=True):
+            if error is not None:
+                lines.append((t, error, colours[i % 8], name, ('-', '--', '-.', ':')[i % 4], width))
+    rows = {name: lines for name, lines in rows.items() if lines}
+    figure, grid = draw_panels(4.2 * len(rows), rows)
     for axes, lines in zip(grid[:, 0], rows.values(), strict=True):
-        known = [line.values[np.isfinite(line.values) & (line.values > 0.0)] for line in lines]
+        known = [size[np.isfinite(size) & (size > 0.0)] for _, size, *_ in lines]
         if highest := [float(size.max()) for size in known if size.size]:
             # Not the least of all, as an error begins at zero; a law that diverges leaves the axes.
             low = float(np.percentile(np.concatenate(known), 2))
             limit_decades(axes, low, min(max(highest), 1e3 * float(np.median(highest))))
     label(grid[0, 0], 'Control error')
-    label(grid[-1, 0], 'Tracking error, where y is meant to follow' if tracking else '')
+    label(grid[-1, 0], 'Tracking error, where y is meant to follow' if len(rows) > 1 else '')
     legend_below(figure, grid[0, 0], columns=3)
     return figure
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from math import isnan, nan
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -32,66 +32,50 @@ from backlash_ros.tools.runs.read_run import find_bag
 from backlash_ros.topics import BACKLASH
 
 
-@dataclass(frozen=True)
-class Source:
-    """A run as it was recorded. reports: as for `core.simulation.replay.replay`."""
+class Source(NamedTuple):
+    """A recorded run and what it is replayed with; reports as `core.simulation.replay` takes them.
+    """
 
     path: Path
     recorded: RunRecord
     parameters: Parameters
-    reports: Sequence[Sequence[float]]
-
-    def replayed(self, parameters: Parameters, title: str) -> RunRecord:
-        """Through a controller with these parameters; raises BrokenOffError."""
-        with tqdm(total=self.recorded.samples, file=sys.stderr, disable=None, leave=False,
-                  desc=title) as bar:
-            try:
-                return replay(self.recorded, parameters, lambda _: bar.update(), self.reports)
-            except ParameterError:
-                raise
-            except ValueError as error:
-                raise cli.BrokenOffError(f'the replay broke off: {error}') from error
+    reports: Sequence[Sequence[float]] = ()
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """The options."""
     parser = OptionParser('replay', description=__doc__)
     parser.add_argument('runs', type=Path, nargs='+', metavar='RUN',
                         help='a bag, a folder of results, or a log, as identify reads it, with '
                              '--config; several give a table')
-    parser.add_argument('--config', type=Path, metavar='FILE',
-                        help='parameters (default: parameters.yaml beside the run)')
-    parser.add_argument('--set', action='append', default=[], metavar='KEY=VALUE',
-                        dest='settings', help='change one parameter; may be given again')
-    cli.add_options(parser, '--columns', '--sweep', '--axis', '--from', '--to', '--out')
+    cli.add_options(parser, '--config', '--set', '--columns', '--sweep', '--axis', '--from', '--to',
+                    '--out')
     return parser
 
 
 def _replay(args: Sequence[str] | None) -> None:
     parser = make_parser()
     options = parser.parse_args(args)
-    span = cli.span_of(parser, options)
-    changes = combinations(options.sweep)
+    span, changes = cli.span_of(parser, options), combinations(options.sweep)
     sources = [_opened(path, options, span) for path in options.runs]
     if len(sources) * len(changes) == 1:
         _one(sources[0], options.out)
         return
-    rows = []
-    header = ('run', 'changed', *BACKLASH, *(f'std_{name}' for name in BACKLASH),
-              'tracking from [s]', 'innovation RMS')
+    rows: list[tuple[str | float, ...]] = []
     for source in sources:
         for change in changes:
             words = ' '.join(f'{name}={as_yaml(value)}' for name, value in change.items())
-            run = source.replayed(source.parameters.replaced(change), f'{source.path.name} {words}')
-            rows.append(((str(source.path), words), _numbers(run)))
+            run = _replayed(source._replace(parameters=source.parameters.replaced(change)), words)
+            rows.append((str(source.path), words, *_numbers(run)))
+    header = ('run', 'changed', *BACKLASH, *(f'std_{name}' for name in BACKLASH),
+              'tracking from [s]', 'innovation RMS')
     path = result_directory(options.out) / 'replays.csv'
-    write_table(path, header, [(*names, *values) for names, values in rows])
-    print(cli.format_table(header, [(*names, *map(cli.number, values)) for names, values in rows]))
+    write_table(path, header, rows)
+    print(cli.format_table(header, [
+        [cell if isinstance(cell, str) else cli.number(cell) for cell in row] for row in rows]))
     print(path)
 
 
 def _opened(path: Path, options: argparse.Namespace, span: cli.Span) -> Source:
-    """The run, the parameters with which it is to be replayed, and what its driver reported."""
     run, applied = read_run_or_log(path, options.config, span, options.axis, options.columns)
     for text in run.notes:
         print(f'replay: {"warning: " if applied is None else ""}{text}', file=sys.stderr)
@@ -99,32 +83,41 @@ def _opened(path: Path, options: argparse.Namespace, span: cli.Span) -> Source:
         raise cli.InputError(f'{path}: ' + (
             'no parameters.yaml stands beside it: give --config' if applied is None else
             'is a log: give --config, like identified.yaml of `identify`'))
-    changes = {}
-    for text in options.settings:
-        setting = parse_setting(text)
-        if setting.axis:
-            raise cli.InputError(f'--set {text!r}: leave out the axis: there is one run')
-        changes[setting.name] = setting.value
-    parameters = run.parameters.replaced(changes)
+    settings = list(map(parse_setting, options.settings))
+    if any(setting.axis for setting in settings):
+        raise cli.InputError('--set: leave out the axis: there is one run')
+    parameters = run.parameters.replaced({setting.name: setting.value for setting in settings})
     if applied is not None:
         # Its v is what acted, in every interval.
         parameters = parameters.replaced({'estimator.use_applied_control': 'true'})
         return Source(path, run.record, parameters, applied)
     use, bag = report_use(parameters), find_bag(path)
-    reports: Sequence[Sequence[float]] = ()
-    if use != 'false' and bag is not None:
-        reports = read_reports(bag, run.record.column('y'), options.axis)
+    reports = read_reports(bag, run.record.column('y'), options.axis) \
+        if use != 'false' and bag is not None else []
     if use == 'true' and not reports:
         print(f'replay: warning: {path}: holds no applied_control: v is that of control',
               file=sys.stderr)
     return Source(path, run.record, parameters, reports)
 
 
+def _replayed(source: Source, title: str = '') -> RunRecord:
+    """Raises BrokenOffError."""
+    with tqdm(total=source.recorded.samples, desc=f'{source.path.name} {title}', leave=False,
+              disable=None) as bar:
+        try:
+            return replay(source.recorded, source.parameters, lambda _: bar.update(),
+                          source.reports)
+        except ParameterError:
+            raise
+        except ValueError as error:
+            raise cli.BrokenOffError(f'the replay broke off: {error}') from error
+
+
 def _one(source: Source, out: Path | None) -> None:
     """What `simulate` writes, a figure beside it, and where the replay parts from the run."""
     recorded = source.recorded
     cli.print_warnings('replay', source.parameters)
-    replayed = source.replayed(source.parameters, source.path.name)
+    replayed = _replayed(source)
     directory = result_directory(out)
     summary = write_report(Run(replayed, source.parameters), directory)
     write_atomically(directory / 'replay.png', figures.png(draw_replay(recorded, replayed)))
@@ -133,8 +126,7 @@ def _one(source: Source, out: Path | None) -> None:
          cli.number(summary['final_std'][name], 2)) for name in BACKLASH
     ]))
     print(_states(replayed) if isnan(recorded.column('m')[-1]) else _parted(recorded, replayed))
-    print(directory / 'replay.png')
-    print(directory / REPORT_PAGE)
+    print(directory / 'replay.png', directory / REPORT_PAGE, sep='\n')
 
 
 def _states(run: RunRecord) -> str:
@@ -148,9 +140,7 @@ def _states(run: RunRecord) -> str:
 
 def _parted(recorded: RunRecord, replayed: RunRecord) -> str:
     parted = parting(recorded, replayed)
-    if parted is None:
-        return 'the estimates are those of the run, to the last bit'
-    return (
+    return 'the estimates are those of the run, to the last bit' if parted is None else (
         f'the estimates part from those of the run at t = {parted.t:.4g} s: {parted.name} was '
         f'{parted.recorded:.6g} and is {parted.replayed:.6g}; by {parted.largest:.3g} standard '
         'deviations at most'
@@ -173,15 +163,14 @@ def draw_replay(recorded: RunRecord, replayed: RunRecord) -> Figure:
     names = {f'${figures.HATS[name]}$ [{figures.BACKLASH_UNITS[name]}]': name for name in BACKLASH}
     of_log = isnan(recorded.column('m')[-1])
     figure, grid = figures.draw_panels(10.0, {
-        text: [figures.Line(t, recorded.column(name), hues['y_m'], 'run', width=2.6)] * (not of_log)
-        + [figures.Line(t, replayed.column(name), hues.get(name, hues['e']), 'replay')]
+        text: [*[(t, recorded.column(name), hues['y_m'], 'run', '-', 2.6)] * (not of_log),
+               (t, replayed.column(name), hues.get(name, hues['e']), 'replay')]
         for text, name in {**names, 'innovation [y]': 'innovation', '': 'status'}.items()
-    }, [figures.WHOLE_RUN], height_ratios=[1.0, 1.0, 1.0, 1.0, 0.5])
+    }, height_ratios=[1.0, 1.0, 1.0, 1.0, 0.5])
     for axes, name in zip(grid[:, 0], BACKLASH, strict=False):
         again, std = replayed.column(name), replayed.column(f'std_{name}')
         figures.band(axes, t, again - std, again + std, hues[name])
-        low, high = np.nanpercentile(
-            np.concatenate([recorded.column(name), again]), [1.0, 99.0])
+        low, high = np.nanpercentile(np.concatenate([recorded.column(name), again]), [1.0, 99.0])
         room = 0.2 * (high - low) or 0.1 * max(abs(high), 1e-9)
         axes.set_ylim(low - room, high + room)
     figures.legend_above(grid[0, 0])
