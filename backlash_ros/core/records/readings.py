@@ -1,7 +1,7 @@
 """Which values of y are readings of their own, and of the quantity that is meant.
 
-Sensors that are slower than the log repeat their value, drivers write a fixed number where a read
-failed, and angles begin anew after a turn. Each is recognised only where nothing else explains it.
+Repetitions of a slower sensor, the fixed number of a read that failed and angles that begin anew
+are recognised only where nothing else explains them.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ NEARLY_ALL = 0.9  # share of what speaks for an explanation
 
 
 def quantum(y: Array) -> float:
-    """Step of a quantised y (N,), nan where it is not known; 0 where it is not quantised."""
+    """Step of a quantised y (N,), 0 where it is not quantised."""
     values = np.unique(y[np.isfinite(y)])
     if len(values) < 2 or len(values) > 0.8 * len(y):
         return 0.0
@@ -43,8 +43,7 @@ def own_readings(t: Array, y: Array) -> tuple[Flags, float]:
     changed = np.flatnonzero(moves != 0.0) + 1
     if not fewest_changes <= len(changed) <= 0.7 * len(values):
         return every
-    least = quantum(values) or 1e-9 * float(np.ptp(values))
-    clear = np.abs(moves[changed - 1]) >= 3.0 * least
+    clear = np.abs(moves[changed - 1]) >= 3.0 * (quantum(values) or 1e-9 * np.ptp(values))
     inner = changed[clear & (changed > 1) & (changed < len(values) - 1)]
     alone = (moves[inner - 2] == 0.0) & (moves[inner] == 0.0)
     if len(inner) < fewest_changes or np.mean(alone) < NEARLY_ALL:
@@ -54,13 +53,12 @@ def own_readings(t: Array, y: Array) -> tuple[Flags, float]:
     low, period, high = np.nanpercentile(since, [15.0, 50.0, 85.0]).tolist()
     if not high - low <= period:
         return every
-    own = np.zeros(len(y), dtype=bool)
     begins, ends = np.append(0, changed), np.append(changed, len(times))
     until = np.append(times[changed], times[-1] + period)
     counts = np.maximum(((until - times[begins]) / period + 0.5).astype(int), 1)
     number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-    due = np.repeat(times[begins], counts) + period * (number - 1e-9)
-    at = np.searchsorted(times, due)
+    at = np.searchsorted(times, np.repeat(times[begins], counts) + period * (number - 1e-9))
+    own = np.zeros(len(y), dtype=bool)
     own[known[at[at < np.repeat(ends, counts)]]] = True
     return own, float(period)
 
@@ -100,8 +98,8 @@ def unwrapped(values: Array) -> tuple[Array, float]:
     turn_tolerance = 0.02  # relative, of the jump of an angle that begins anew
     # Degrees, radians, gradians, steps of encoders.
     turns = (360.0, 2.0 * np.pi, 400.0, 6400.0, 3600.0, *(2.0**n for n in range(8, 33)))
-    known = np.flatnonzero(np.isfinite(values))
-    if len(known) < 10:
+    known = np.isfinite(values)
+    if known.sum() < 10:
         return values, 0.0
     steps, reach = np.diff(values[known]), float(np.ptp(values[known]))
     usual = float(np.percentile(np.abs(steps), 95.0))
@@ -114,16 +112,15 @@ def unwrapped(values: Array) -> tuple[Array, float]:
         motion = np.convolve(np.where(jumps, 0.0, steps), np.ones(7), mode='same')[jumps]
         if (off <= max(turn_tolerance * turn, 5.0 * usual)).all() and \
                 np.mean(motion * np.sign(steps[jumps]) < 0.0) >= 0.8:
-            return _without(turn, np.flatnonzero(jumps), values), turn
+            return _without(turn, jumps, values), turn
     return values, 0.0
 
 
-def _without(turn: float, jumps: NDArray[np.intp], values: Array) -> Array:
-    """The values (N,) less a turn after each jump of the known ones."""
-    known = np.flatnonzero(np.isfinite(values))
-    moves, out = np.zeros(len(known)), values.copy()
-    moves[jumps + 1] = turn * np.sign(np.diff(values[known])[jumps])
-    out[known] -= np.cumsum(moves)
+def _without(turn: float, jumps: Flags, values: Array) -> Array:
+    """The values (N,) less a turn after each jump from a known one to the next."""
+    known, out = np.isfinite(values), values.copy()
+    turns = np.where(jumps, turn * np.sign(np.diff(values[known])), 0.0)
+    out[known] -= np.append(0.0, np.cumsum(turns))
     return out
 
 
@@ -137,12 +134,13 @@ def without_slips(y: Array, v: Array) -> tuple[Array, float]:
     if len(steps) < 20:  # too few to judge a jump by
         return y, 0.0
     usual = 3.0 * float(np.percentile(np.abs(steps), 95.0))
-    jumps = np.flatnonzero(np.abs(steps) > 10.0 * usual)
+    jumps = np.abs(steps) > 10.0 * usual
     moves = np.abs(np.diff(v, prepend=v[0]))
     lively = 3.0 * float(np.percentile(moves, 95.0))
-    for turn in (2.0 * np.pi, 360.0) if 0 < len(jumps) <= 0.01 * len(steps) else ():
+    for turn in (2.0 * np.pi, 360.0) if 0 < jumps.sum() <= 0.01 * len(steps) else ():
         whole = np.abs(np.abs(steps[jumps]) - turn) <= usual + 1e-3 * turn
-        alone = [moves[max(known[k] - 50, 0):known[k + 1] + 5].max() <= lively for k in jumps]
+        alone = (moves[max(known[k] - 50, 0):known[k + 1] + 5].max() <= lively
+                 for k in np.flatnonzero(jumps))
         if whole.all() and all(alone):
             return _without(turn, jumps, y), turn
     return y, 0.0

@@ -1,4 +1,7 @@
-"""Stamps of a log in seconds, and its rows in the order of time, without stamps that are none."""
+"""Stamps of a log in seconds, and its rows in the order of time, without stamps that are none.
+
+What was done is added to `said`, a sentence each.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +16,9 @@ Array = NDArray[np.float64]
 def in_seconds(
     t: Array | None, count: int, period: float | None, unit_s: float | None, said: list[str],
 ) -> Array:
-    """Stamps [s] of `count` rows; rows are counted where there are none, or none that move.
+    """Stamps [s] of `count` rows, by their number where there are none, or none that move.
 
-    unit_s: of the stamps, None where the log does not say it: then years since 1970 tell it, or the
-    period. What was guessed is added to said. Raises RecordError where the period is needed.
+    unit_s: None where the log does not say it. Raises RecordError where the period is needed.
     """
     known = np.empty(0) if t is None else t[np.isfinite(t)]
     if t is None or np.unique(known).size < 2:
@@ -24,9 +26,9 @@ def in_seconds(
         if period is None:
             raise RecordError(f'{what}: give --period S, the time from row to row')
         said.append(f'{what}: rows are counted')
-        return np.asarray(period * np.arange(count, dtype=float))
-    t = np.where(np.isfinite(t), t, np.nan)
+        return period * np.arange(count, dtype=np.float64)
     unit_s = unit_s or _guessed_unit(known, period, said)
+    t = np.where(np.isfinite(t), t, np.nan)
     # A clock of 16 or 32 bits, of a day, half a day, an hour.
     for around in (2.0**16, 2.0**32, *(hours * 3600.0 / unit_s for hours in (24.0, 12.0, 1.0))):
         falls = np.diff(t, prepend=t[0]) < -0.5 * around
@@ -42,7 +44,6 @@ def in_seconds(
 
 
 def _guessed_unit(known: Array, period: float | None, said: list[str]) -> float:
-    """Unit [s] of stamps of which nothing else tells it."""
     size = np.median(np.abs(known))
     for least, scale, unit in (1e17, 1e-9, 'ns'), (1e14, 1e-6, 'µs'), (1e11, 1e-3, 'ms'):
         if size > least:  # in this century
@@ -50,11 +51,10 @@ def _guessed_unit(known: Array, period: float | None, said: list[str]) -> float:
             return scale
     step = typical_step(known if known[-1] > known[0] else known[::-1])
     whole = step >= 1.0 and bool((known == np.round(known)).all())
-    # Seconds since 1970, of dates as well, speak for themselves.
-    if period is None and whole and size < 1e9:
-        said.append('t, in whole numbers, is taken as seconds; if it counts something else: '
-                    '--period')
     if period is None:
+        if whole and size < 1e9:  # else since 1970
+            said.append('t, in whole numbers, is taken as seconds; if it counts something else: '
+                        '--period')
         return 1.0
     for scale in (1e-3, 1e-6, 1e-9, 60.0):
         if abs(step * scale / period - 1.0) < 0.3:
@@ -75,10 +75,9 @@ def typical_step(t: Array) -> float:
 
 
 def in_order(t: Array, said: list[str], what: str = 'row') -> NDArray[np.intp]:
-    """Rows of the stamps t (N,) [s] that are kept, by time.
+    """Rows of the stamps t (N,) [s] that are kept, by time. what: name of a row.
 
-    what: name of a row in said, to which is added what was done. Raises RecordError where the
-    stamps make no sense.
+    Raises RecordError where the stamps make no sense.
     """
     def count(number: int, of: str = what) -> str:
         return f'{number} {of}{"" if number == 1 else "s"}'
