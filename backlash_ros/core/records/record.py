@@ -24,10 +24,9 @@ class Record:
     """One motion on a uniform grid of sample_period [s], N samples.
 
     v (N,): acts from sample k to k+1, finite. y (N,): at k; nan where there is no reading of its
-    own: lost, or the one before it repeated. quantum: step of the readings of y, 0 where they have
-    none; y that was moved onto the grid hides it. commands (N,): what led to v, where v is that of
-    a motor encoder; None where v is the command itself. timing: one sentence on what was done to
-    the stamps. notes: what else was done, a sentence each. source: where it is from.
+    own. quantum: step of the readings of y before they were moved onto the grid, 0 for none.
+    commands (N,): what led to v, where v is that of a motor encoder. timing: one sentence on what
+    was done to the stamps. notes: what else was done, a sentence each. source: where it is from.
     """
 
     v: Array
@@ -41,14 +40,12 @@ class Record:
 
     @property
     def lost(self) -> int:
-        """Samples without a reading of y."""
         return int(np.isnan(self.y).sum())
 
     def between(self, from_s: float, to_s: float) -> Record:
         """The samples from from_s on and before to_s [s]; raises RecordError where none is."""
         t = self.sample_period * np.arange(len(self.v))
-        # A time that is a sample's up to rounding is that sample's.
-        slack = 1e-6 * self.sample_period
+        slack = 1e-6 * self.sample_period  # of rounding
         kept = (t >= from_s - slack) & (t < to_s - slack)
         if not kept.any():
             raise RecordError('there is no sample between --from and --to')

@@ -1,26 +1,54 @@
-"""From the columns of a log, as they are, to a record."""
+"""From rows of a log with stamps of any kind to v and y on one uniform grid.
+
+Two kinds of uneven stamps are told apart by the motion itself, which is smooth over the true
+instants: either the samples were taken evenly and their stamps are late, then rows are numbered; or
+they were taken at those instants. Then v, which holds from row to row, is averaged over each period
+of the grid, and y is moved onto it only where the error of that is hidden by its noise; else the
+grid is finer, with nothing between the readings.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.control.limits import LARGEST_SIGNAL
-from backlash_ros.core.records.readings import (
-    failed,
-    own_readings,
-    quantum,
-    unwrapped,
-    without_slips,
-)
-from backlash_ros.core.records.record import Record, RecordError
-from backlash_ros.core.records.stamps import in_order, in_seconds, spread_evenly
-from backlash_ros.core.records.timing import Rows, on_grid
+from backlash_ros.core.loop.command_history import v_of_intervals
+from backlash_ros.core.loop.sample_counter import CLOCK_SLACK, JITTER
+from backlash_ros.core.records import readings, samples, stamps
+from backlash_ros.core.records.record import Record, RecordError, seconds
 
 Array = NDArray[np.float64]
+Numbers = NDArray[np.int64]
+
+BREAK = 3.0  # periods from row to row that are a gap
+MOST_SAMPLES = 1_000_000  # of a grid
+
+
+class Rows(NamedTuple):
+    """Rows in order. t (M,) [s]. y (M,): nan where it is no reading of its own.
+
+    v, commands: (M,), or times and values of their own (2, K), as in a log of events. reported:
+    whether those of v tell what acted until then.
+    """
+
+    t: Array
+    v: Array
+    y: Array
+    commands: Array | None = None
+    reported: bool = False
+
+
+class Numbering(NamedTuple):
+    """Of rows (M,), whose stamps lie around begin + period * numbers [s], off (M,) that."""
+
+    numbers: Numbers
+    period: float
+    begin: float
+    off: Array
 
 
 def record_of(
@@ -32,26 +60,26 @@ def record_of(
     t: stamps, None where there are none. period [s]: from sample to sample, None tells it from the
     stamps. unit_s: of the stamps [s], None where the log does not say it. Raises RecordError.
     """
-    said: list[str] = []
-    notes: list[str] = []
+    said, notes = list[str](), list[str]()
     if len(v) < 2:
         raise RecordError(f'holds {len(v)} row, which is no motion')
-    stamps = in_seconds(t, len(v), period, unit_s, said)
+    times = stamps.in_seconds(t, len(v), period, unit_s, said)
     # t, v, y and the commands, a row each.
-    table = np.array([stamps, v, y] if commands is None else [stamps, v, y, commands])
+    table = np.array([times, v, y] if commands is None else [times, v, y, commands])
     for name, values in zip('vy', table[1:3], strict=True):
         infinite = np.isinf(values)
         if infinite.any():
             notes.append(f'{name} is infinite in {infinite.sum()} rows: taken as lost')
             values[infinite] = np.nan
-    table = table[:, in_order(stamps, said)]
+    table = table[:, stamps.in_order(times, said)]
     _check(v=table[1], y=table[2])
     sent = None
     known_v, known_y = np.isfinite(table[1:3])
     if (known_v & known_y).sum() < 0.05 * min(known_v.sum(), known_y.sum()):
         said.append('v and y stand in rows of their own')
         sent = table[:2, known_v]
-        table[1] = _held(np.where(np.arange(len(table[1])) > 0, table[1], sent[1, 0]))
+        table[1, 0] = sent[1, 0]
+        table[1] = _held(table[1])
         table = table[:, known_y]
     same = (table[:3, 1:] == table[:3, :-1]) | (np.isnan(table[:3, 1:]) & np.isnan(table[:3, :-1]))
     again = np.append(False, same.all(axis=0))
@@ -59,16 +87,17 @@ def record_of(
         said.append(f'{again.sum()} rows that repeat the one before left out')
         table = table[:, ~again]
     table = table[:, int(np.argmax(np.isfinite(table[1]))):]
-    t = spread_evenly(table[0] - table[0, 0], said, *table[1:3])
-    v, y = readings(t, _held(table[1]), table[2], said, notes)
+    begin = table[0, 0]
+    t = stamps.spread_evenly(table[0] - begin, said, *table[1:3])
+    v, y = without_turns(t, _held(table[1]), table[2], said, notes)
     _check(y=y)
     if sent is not None:
-        v = sent - np.array([[table[0, 0]], [0.0]])
+        v = sent - np.array([[begin], [0.0]])
     record = on_grid(Rows(t, v, y, None if commands is None else _held(table[3])), period)
     return usable(record, y, said, notes)
 
 
-def readings(
+def without_turns(
     t: Array, v: Array, y: Array, said: list[str], notes: list[str],
 ) -> tuple[Array, Array]:
     """v (N,) and y (N,) at t (N,) without whole turns; y nan where it is no reading of its own.
@@ -76,45 +105,43 @@ def readings(
     What was done is added to said and notes.
     """
     # An angle that begins anew is far from the rows around as well.
-    bad, value = failed(unwrapped(y)[0])
+    bad, value = readings.failed(readings.unwrapped(y)[0])
     if bad.any():
         notes.append(f'y reads exactly {value:.6g} in {bad.sum()} of {len(bad)} rows, far from the '
                      'rows around: taken for reads that failed')
         y = np.where(bad, np.nan, y)
-    (y, turn_of_y), (v, turn_of_v) = unwrapped(y), unwrapped(v)
-    for name, turn in (('y', turn_of_y), ('v', turn_of_v)):
-        if turn:
-            notes.append(f'{name} jumps by {turn:.6g} where it begins anew: the turns are counted')
-    y, turn = without_slips(y, v)
+    (y, turn_of_y), (v, turn_of_v) = readings.unwrapped(y), readings.unwrapped(v)
+    notes += [f'{name} jumps by {turn:.6g} where it begins anew: the turns are counted'
+              for name, turn in (('y', turn_of_y), ('v', turn_of_v)) if turn]
+    y, turn = readings.without_slips(y, v)
     if turn:
         notes.append(f'y jumps by {turn:.6g}, a whole turn, while v does not: taken out')
-    own, sensor_period = own_readings(t, y)
+    own, sensor_period = readings.own_readings(t, y)
     if sensor_period:
         said.append(f'y repeats {len(y) / own.sum():.2g} times: {1.0 / sensor_period:.3g} Hz')
     return v, np.where(own, y, np.nan)
 
 
-def usable(
-    record: Record, read: Array, said: Sequence[str] = (), notes: Sequence[str] = (),
-) -> Record:
+def usable(record: Record, read: Array, said: list[str], notes: list[str]) -> Record:
     """From the first known v on; a v that is not known is the one before it.
 
-    Before the first command the motor rests where it is. read: readings of y, whose step counts.
-    said: on the stamps. Raises RecordError where v or y are no measurements.
+    read: readings of y, whose step counts. Raises RecordError where v or y are no measurements.
     """
     _check(v=record.v, y=record.y)
     first = int(np.argmax(np.isfinite(record.v)))
-    v, y, commands = _held(record.v)[first:], record.y[first:], record.commands
+    v, commands = _held(record.v)[first:], record.commands
     if np.ptp(v) == 0.0:
         raise RecordError(f'v does not move, it is {v[0]:.6g} throughout: move it to and fro, past '
                           'the gap; if another column is the command, name it with --columns')
     if commands is not None:
         commands = _held(commands)[first:]
+        # Before the first command the motor rests where it is.
         commands = np.where(np.isnan(commands), v[0], commands)
         commands = commands if np.abs(commands).max() <= LARGEST_SIGNAL else None
     return replace(
-        record, v=v, y=y, sample_period=float(f'{record.sample_period:.9g}'), quantum=quantum(read),
-        timing='; '.join([record.timing, *said]), notes=tuple(notes), commands=commands)
+        record, v=v, y=record.y[first:], sample_period=float(f'{record.sample_period:.9g}'),
+        quantum=readings.quantum(read), timing='; '.join([record.timing, *said]),
+        notes=tuple(notes), commands=commands)
 
 
 def _check(**signals: Array) -> None:
@@ -133,3 +160,202 @@ def _held(values: Array) -> Array:
     """With the one before it for each that is not known."""
     newest = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), 0))
     return np.asarray(values[newest])
+
+
+def on_grid(rows: Rows, period: float | None = None, late: bool = False) -> Record:
+    """Rows on a grid. period [s]: of the samples, None tells it from the stamps.
+
+    late: stamps are those of messages, which are late, never early. Raises RecordError where there
+    are too few, or they are spread over too long a time.
+    """
+    nearly_even = 0.02  # of a period that stamps of even samples may be off
+    guess = period or (stamps.typical_step(rows.t) if late else _period(rows.t))
+    rows, cut = _longest_stretch(rows, guess)
+    if not np.isfinite(rows.y).any():
+        raise RecordError(f'{cut}but y holds no number there: cut out one motion with --from, --to')
+    steps = np.diff(rows.t) / guess
+    found = _numbering(rows.t, steps, guess, late)
+    used = period or found.period
+    if late or (np.abs(found.off).max() <= nearly_even * guess
+                and abs(found.period / used - 1.0) <= nearly_even):
+        what = 'messages of y' if late else 'rows'
+        return _numbered_grid(rows, found.numbers, used,
+                              f'{cut}{len(rows.t)} {what}, one every {seconds(used)}')
+    inner = steps[steps <= BREAK * max(float(np.median(steps)), 1.0)]
+    jitter = 0.5 * float(np.ptp(np.percentile(inner, [16.0, 84.0])))
+    # A few odd ones among even stamps are told as well.
+    percent = f'{100.0 * (jitter if jitter > 0.005 else float(np.std(inner))):.2g} %'
+    if period is not None:
+        found = _along(_numbered(rows.t / period), rows.t)
+    # Too many may be missing, or too late, to be numbered.
+    if found.numbers[-1] + 1 <= 1.3 * len(rows.t) and np.std(found.off) <= found.period and sum(
+            samples.rougher(rows.t, found.numbers.astype(float), signal)
+            for signal in (rows.y, rows.v) if signal.ndim == 1) > 0.05:
+        return _numbered_grid(
+            rows, found.numbers, used, f'{cut}stamps are uneven by {percent} of {seconds(used)}, '
+            'the motion is not: rows are numbered')
+    begin = float(rows.t[0])
+    if period is None and np.abs(found.off).max() <= 0.5 * used:
+        begin = found.begin
+    else:
+        used = guess
+    how = f'jitter by {percent} around {seconds(used)}'
+    if jitter <= 1e-3 and period is not None:
+        how = f'come every {seconds(_period(rows.t))}, for samples of {seconds(used)}'
+    return _true_instants(rows, begin, used, f'{cut}stamps {how}: v and y are taken at them')
+
+
+def _period(t: Array) -> float:
+    """Time from row to row, roughly."""
+    steps = np.diff(t)
+    steps = steps[steps <= BREAK * stamps.typical_step(t)]
+    low, middle, high = np.percentile(steps, [15.0, 50.0, 85.0]).tolist()
+    # With many equal stamps, or uneven steps, the mean tells it.
+    return float(f'{middle if high - low < 0.5 * middle else float(np.mean(steps)):.6g}')
+
+
+def _longest_stretch(rows: Rows, period: float) -> tuple[Rows, str]:
+    """Without what lies far before and after, where the time between holds no rows; said so."""
+    long_break = 100.0  # periods of a gap that ends a stretch
+    t, span = rows.t, np.ptp(rows.t) / period
+    if span < min(20.0 * len(t) + long_break, MOST_SAMPLES):
+        return rows, ''
+    ends = np.flatnonzero(np.diff(t, prepend=-np.inf, append=np.inf) > long_break * period)
+    k = int(np.argmax(np.diff(ends)))
+    part = slice(ends[k], ends[k + 1])
+    if len(t[part]) < 2 or np.ptp(t[part]) >= MOST_SAMPLES * period:
+        raise RecordError(
+            f'spans {span:.3g} periods of {seconds(period)} with {len(t)} rows: cut out one motion '
+            'with --from and --to, or give --period')
+    cut = Rows(*(each[part] if isinstance(each, np.ndarray) and each.ndim == 1 else each
+                 for each in rows))
+    gaps = f'{len(ends) - 2} long gap{"s" * (len(ends) > 3)}'
+    return cut, f'{gaps}: the longest stretch, {len(cut.t)} rows, is used; '
+
+
+def _along(numbers: Numbers, t: Array) -> Numbering:
+    """With the line that fits t (M,) [s] best."""
+    period, begin = np.polyfit(numbers, t, 1).tolist()
+    return Numbering(numbers, period, begin, t - begin - period * numbers)
+
+
+def _numbering(t: Array, steps: Array, period: float, late: bool) -> Numbering:
+    """The numbers of rows t (M,) that lie closest to a line. steps (M - 1,): in periods."""
+    found = [_along(_numbered(t / period), t)]
+    if not late:
+        # The median of uneven steps is off by more than a long record bears.
+        usual = steps[steps < 0.5 * BREAK]
+        mean = period * (float(np.mean(usual)) if usual.any() else 1.0)
+        found += [_along(numbers, t) for numbers in (
+            _risen(np.append(0.0, np.cumsum(np.round(steps)))), _numbered(t / mean),
+            _risen(np.round((t - t[0]) / period)))]
+        # Around the line that all of them tell, as far as they are late by less than a period.
+        found += [_along(_risen(np.round((t - one.begin) / one.period)), t)
+                  for one in found if one.period > 0.0]
+    found = [one for one in found if one.period > 0.0 and one.numbers[-1] < MOST_SAMPLES]
+    if not found:
+        raise RecordError('t does not rise steadily: give --period S, or cut out one motion')
+    best = min(found, key=lambda one: round(float(np.std(one.off)) / one.period, 9))
+    deviation = max(2.0 * float(np.std(best.off)), 1e-12 * period) / float(best.numbers[-1])
+    return best._replace(period=stamps.fewest_digits(best.period, deviation))
+
+
+def _numbered(times: Array) -> Numbers:
+    """Number of each sample from its time [sample periods], rising from 0.
+
+    Samples are late, never early: what comes before the next one is due is still the sample before,
+    and of those that come in a heap the last one is the newest.
+    """
+    begin, number = float(times[0]), 0
+    passed = np.zeros(len(times))
+    for i, time in enumerate(times.tolist()):
+        newest = max(int(time - begin + 1.0 - JITTER), number)
+        begin = min(begin + CLOCK_SLACK * (newest - number), time - newest)
+        passed[i] = number = newest
+    return _risen(passed)
+
+
+def _risen(numbers: Array) -> Numbers:
+    """The numbers strictly rising from 0, the last of a heap keeping its place."""
+    place = np.arange(len(numbers))
+    risen = np.minimum.accumulate((numbers - place)[::-1])[::-1] + place
+    return np.asarray(risen - risen[0], dtype=np.int64)
+
+
+def _numbered_grid(rows: Rows, index: Numbers, period: float, said: str) -> Record:
+    """Each row at its number; v holds over those that are missing."""
+    count = int(index[-1]) + 1
+    y = np.full(count, np.nan)
+    y[index] = rows.y
+    missing = f', {count - len(index)} missing' if count > len(index) else ''
+
+    def over(values: Array, reported: bool = False) -> Array:
+        if values.ndim == 1:
+            return values[np.searchsorted(index, np.arange(count), side='right') - 1]
+        # What is sent more often than samples are taken is averaged.
+        if not reported and values.shape[1] > 1.5 * count:
+            return averaged(values[0] - rows.t[0], values[1], period, count)
+        outputs_ns, sent_ns = ((1e9 * (each - rows.t[0])).astype(np.int64)
+                               for each in (rows.t, values[0]))
+        return v_of_intervals(index, outputs_ns, sent_ns, values[1], reported)
+
+    return Record(over(rows.v, rows.reported), y, period, timing=said + missing,
+                  commands=None if rows.commands is None else over(rows.commands))
+
+
+def _true_instants(rows: Rows, begin: float, period: float, said: str) -> Record:
+    """v averaged over each period from begin [s] on, y where it was read."""
+    hidden, least = 0.5, 1e-3  # error of moving y that is hidden: of its noise, of its swing
+    known = np.isfinite(rows.y)
+    t, y = rows.t[known] - begin, rows.y[known]
+    equal = int(np.count_nonzero(np.diff(rows.t) == 0.0))
+    said += f'; {equal} rows with equal stamps' if equal else ''
+    kept = np.append(np.diff(t) > 0.0, True)
+    t, y = t[kept], y[kept]
+    noise = samples.noise_of(t, y)
+    bend = samples.curvature_of(t, y, noise)
+    swing = float(np.ptp(np.percentile(y, [5.0, 95.0])))
+    noise = max(noise, 12.0**-0.5 * readings.quantum(y), 0.01 * least * swing)
+    for parts in (1, 2, 4):
+        step = period / parts
+        index, values = np.round(t / step).astype(np.int64), y
+        off = index * step - t
+        shared = np.mean(np.diff(index) == 0) > 0.02 if len(index) > 1 else False
+        # A standard deviation, but for steps: nine tenths of normal values stay within 1.64.
+        moved = np.percentile(np.abs(np.gradient(y, t) * off), 90.0) / 1.64 if len(t) > 1 else 0.0
+        if not shared and moved <= hidden * noise:
+            break
+        # Along the line to the next reading on that side.
+        values = np.interp(index * step, t, y)
+        share = np.clip(np.abs(off) / np.maximum(np.gradient(t), step), 0.0, 0.5)
+        error = bend * float(np.sqrt(np.mean((4.0 * share * (1.0 - share))**2)))
+        if error <= max(hidden * noise, least * swing):
+            if shared and parts == 1:
+                # Every instant of the grid between two readings that are near enough.
+                index = np.arange(int(t[0] / step + 1.0 - 1e-9), int(t[-1] / step + 1e-9) + 1)
+                after = np.clip(np.searchsorted(t, index * step), 1, len(t) - 1)
+                index = index[t[after] - t[after - 1] <= 2.0 * step]
+                values = np.interp(index * step, t, y)
+            break
+    said += f', on a grid of {seconds(step)}' if parts > 1 else ''
+    count = int(max((rows.t[-1] - begin) / step + 0.5, index[-1])) + 1
+    full = np.full(count, np.nan)
+    full[index] = values
+
+    def over(values: Array) -> Array:
+        times, v = (rows.t, values) if values.ndim == 1 else values
+        return averaged(times - begin, v, step, count)
+
+    return Record(over(rows.v), full, step, timing=said,
+                  commands=None if rows.commands is None else over(rows.commands))
+
+
+def averaged(t: Array, v: Array, step: float, count: int) -> Array:
+    """v (M,), held from each t (M,) to the next, over each of `count` steps."""
+    edges = step * np.arange(count + 1)
+    begin = np.clip(np.searchsorted(t, edges[:-1], side='right') - 1, 0, len(t) - 1)
+    # Each change counts for what is left of its step: where v rests it stays the same number.
+    changed = np.flatnonzero((t[1:] > edges[0]) & (t[1:] < edges[-1])) + 1
+    of_step = np.searchsorted(edges, t[changed], side='left') - 1
+    share = (v[changed] - v[changed - 1]) * (edges[of_step + 1] - t[changed]) / step
+    return np.asarray(v[begin] + np.bincount(of_step, share, count))

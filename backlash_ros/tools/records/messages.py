@@ -14,9 +14,8 @@ from backlash_ros import topics
 from backlash_ros.core.loop.command_history import REPORTED, without_origin
 from backlash_ros.core.loop.diagnosis import TROUBLE
 from backlash_ros.core.records.record import Record, RecordError
-from backlash_ros.core.records.rows_to_record import readings, usable
+from backlash_ros.core.records.rows_to_record import Rows, on_grid, usable, without_turns
 from backlash_ros.core.records.stamps import in_order
-from backlash_ros.core.records.timing import Rows, on_grid
 from backlash_ros.tools.runs.bag import choose_namespace, read_topics, topic_ends_like
 
 Messages = tuple[NDArray[np.int64], NDArray[np.float64]]  # stamps [ns] and values
@@ -94,7 +93,7 @@ def from_messages(heard: Mapping[str, Messages], period: float | None, of_axis: 
             notes.append(f'{lost} messages of {topic} are missing: the one before is taken for '
                          'them')
             record = replace(record, commands=None)
-    v, own = readings(
+    v, own = without_turns(
         step * np.arange(len(record.y), dtype=float), record.v, record.y, said, notes)
     return usable(replace(record, v=v, y=own), y, said, notes)
 

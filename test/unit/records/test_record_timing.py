@@ -7,9 +7,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from backlash_ros.core.records.record import Record, RecordError
-from backlash_ros.core.records.rows_to_record import record_of
+from backlash_ros.core.records.rows_to_record import averaged, record_of
 from backlash_ros.core.records.stamps import spread_evenly
-from backlash_ros.core.records.timing import averaged
 
 Array = NDArray[np.float64]
 PERIOD_S = 0.01
