@@ -10,7 +10,7 @@ grid is finer, with nothing between the readings.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -227,8 +227,9 @@ def _longest_stretch(rows: Rows, period: float) -> tuple[Rows, str]:
         raise RecordError(
             f'spans {span:.3g} periods of {seconds(period)} with {len(t)} rows: cut out one motion '
             'with --from and --to, or give --period')
-    cut = Rows(*(each[part] if isinstance(each, np.ndarray) and each.ndim == 1 else each
-                 for each in rows))
+    kept: dict[str, Any] = {name: values[part] for name, values in rows._asdict().items()
+                            if np.ndim(values) == 1}
+    cut = rows._replace(**kept)
     gaps = f'{len(ends) - 2} long gap{"s" * (len(ends) > 3)}'
     return cut, f'{gaps}: the longest stretch, {len(cut.t)} rows, is used; '
 
