@@ -33,9 +33,13 @@ from backlash_ros.core.laws.input_reconstruction import InputReconstruction
 from backlash_ros.core.laws.lms import NormalisedLms
 from backlash_ros.core.laws.printed_law import PrintedLaw
 from backlash_ros.core.parameters import BY_NAME, ParameterError, Parameters, PlantModel
-from backlash_ros.core.plant.four_blocks import FourBlocks, place_poles
-from backlash_ros.core.plant.model_check import check_model, model_warnings
-from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
+from backlash_ros.core.plant.numerics import FourBlocks, place_poles
+from backlash_ros.core.plant.transfer_function import (
+    StateModel,
+    TransferFunction,
+    check_model,
+    model_warnings,
+)
 from backlash_ros.core.scenario import (
     build_actuator,
     build_model,

@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from backlash_ros.core.parameters import BY_NAME, Parameters, Value, check_names, check_value
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
-from backlash_ros.core.simulation.metrics import SETTLING_TOLERANCE
+from backlash_ros.core.simulation.run_record import SETTLING_TOLERANCE
 from backlash_ros.tools.cli import (
     ONE_THREAD,
     BrokenOffError,

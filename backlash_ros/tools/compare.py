@@ -16,7 +16,7 @@ from tqdm import tqdm
 from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core.assembly import build_model
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.simulation import metrics
+from backlash_ros.core.simulation import run_record
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.options import OptionParser
 from backlash_ros.tools import cli
@@ -114,18 +114,18 @@ def _measure(
     window = max(round(COMPARISON_WINDOW_S / run.sample_period), 1)
     error = penalty = tracking = None
     if follows:
-        tracking = moving_rms(run.column('y') - metrics.delayed_reference(run, delay), window)
+        tracking = moving_rms(run.column('y') - run_record.delayed_reference(run, delay), window)
         gapless = run_loop(build_closed_loop(p.replaced({
             **GAPLESS, **_fixed(p.backlash.m, 0.0, 0.0), 'fixed.doubt': 0.0,
         })), samples)
         error, best = (
-            metrics.delayed_tracking_error_rms(each, delay, since) for each in (run, gapless)
+            run_record.delayed_tracking_error_rms(each, delay, since) for each in (run, gapless)
         )
         penalty = None if error is None or best is None else error - best
     return Result(name, (
-        metrics.control_error_rms(run), error, penalty,
-        metrics.total_variation(run.column('v')[t >= since]),
-        metrics.gap_crossings_per_reversal(run, since),
+        run_record.control_error_rms(run), error, penalty,
+        run_record.total_variation(run.column('v')[t >= since]),
+        run_record.gap_crossings_per_reversal(run, since),
     ), ErrorCurves(name, t, moving_rms(control_error(run), window), tracking))
 
 

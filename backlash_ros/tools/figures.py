@@ -15,8 +15,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Status
-from backlash_ros.core.simulation.metrics import SETTLING_TOLERANCE
-from backlash_ros.core.simulation.run_record import RunRecord
+from backlash_ros.core.simulation.run_record import SETTLING_TOLERANCE, RunRecord
 from backlash_ros.tools.runs.summary import ErrorCurves, Part, estimated_loop
 from backlash_ros.topics import BACKLASH
 

@@ -18,7 +18,7 @@ from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.loop.command_history import report_use
 from backlash_ros.core.parameters import ParameterError, Parameters, as_yaml
-from backlash_ros.core.simulation.replay import parting, replay
+from backlash_ros.core.simulation.closed_loop import parting, replay
 from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.options import OptionParser
 from backlash_ros.tools import cli, figures
@@ -33,8 +33,7 @@ from backlash_ros.topics import BACKLASH
 
 
 class Source(NamedTuple):
-    """A recorded run and what it is replayed with; reports as `core.simulation.replay` takes them.
-    """
+    """A recorded run and what it is replayed with; reports: as for core's `replay`."""
 
     path: Path
     recorded: RunRecord

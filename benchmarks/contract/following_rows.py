@@ -20,8 +20,7 @@ from backlash_ros.core import Parameters, Status, build_closed_loop
 from backlash_ros.core.assembly import build_model
 from backlash_ros.core.plant.simulated_plant import altered_plant
 from backlash_ros.core.plant.transfer_function import TransferFunction
-from backlash_ros.core.simulation.metrics import gap_crossings_per_reversal, turns
-from backlash_ros.core.simulation.run_record import RunRecord
+from backlash_ros.core.simulation.run_record import RunRecord, gap_crossings_per_reversal, turns
 
 Changes = dict[str, Any]
 

@@ -18,8 +18,7 @@ from matplotlib.figure import Figure
 from reporting import write_between
 from tables import TABLES, WITHOUT, parameters_page, simulate
 
-from backlash_ros.core.simulation.metrics import delayed_reference
-from backlash_ros.core.simulation.run_record import RunRecord
+from backlash_ros.core.simulation.run_record import RunRecord, delayed_reference
 from backlash_ros.tools import figures as drawn
 from backlash_ros.tools.figures import BACKLASH_UNITS, HATS, HUES, TIME_LABEL, curve, label
 from backlash_ros.tools.runs.summary import compare_laws, interesting_parts

@@ -18,8 +18,7 @@ from places import ROOT
 from ros_processes import ros_world
 
 from backlash_ros import topics
-from backlash_ros.core.simulation.closed_loop import build_closed_loop
-from backlash_ros.core.simulation.replay import parting, replay
+from backlash_ros.core.simulation.closed_loop import build_closed_loop, parting, replay
 from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.tools.config import effective_parameters
 from backlash_ros.tools.records.reading import read_record

@@ -1,6 +1,6 @@
 """The four-block structure of Tao and Kokotović: u_d from filtered u_d, y and r, v = BI(u_d).
 
-The filters, the gains and what they make of the loop stand in four_blocks.py.
+The filters, the gains and what they make of the loop stand in numerics.py.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from backlash_ros.core.control.protocol import (
     ControlStructure,
 )
 from backlash_ros.core.estimate import Estimate, Status
-from backlash_ros.core.plant.four_blocks import FourBlocks
+from backlash_ros.core.plant.numerics import FourBlocks
 
 Array = NDArray[np.float64]
 

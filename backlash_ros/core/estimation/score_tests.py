@@ -28,9 +28,8 @@ from backlash_ros.core.estimation.explanations import Window
 from backlash_ros.core.estimation.fit import Problem
 from backlash_ros.core.estimation.posterior import WindowFit
 from backlash_ros.core.plant.backlash import clamp, play
-from backlash_ros.core.plant.model_check import ON_CIRCLE
 from backlash_ros.core.plant.numerics import lfilter
-from backlash_ros.core.plant.transfer_function import memory_of
+from backlash_ros.core.plant.transfer_function import ON_CIRCLE, memory_of
 
 Array = NDArray[np.float64]
 

@@ -1,16 +1,10 @@
 """Whether estimates agree with what was measured lately, for laws that have no deviations.
 
-u, or what is made of it linearly, is t = theta' phi for the true theta = (m, m c_r, m c_l), and
-t - theta_hat' phi = (theta - theta_hat)' phi. A small error at one sample says little: a large step
-makes it so whatever theta_hat is. Over many samples, with R = E{phi phi'} and phi scaled to
-E{phi_i^2} = 1,
+u, or what is made of it linearly, is t = theta' phi for the true theta = (m, m c_r, m c_l). With
+R = E{phi phi'} over many samples, and phi scaled to E{phi_i^2} = 1, the estimates may be wrong by
 
     |theta - theta_hat|^2 <= E{(t - theta_hat' phi)^2} / (smallest eigenvalue of R)
-
-which is what the estimates may be wrong by.
 """
-
-from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,8 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Estimate, Status
-
-Array = NDArray[np.float64]
 
 # Square of a signal below which it counts as none. Its inverse, times the square of any
 # measurement, still is a number.
@@ -42,7 +34,7 @@ class Agreement:
         self.status = Status.ACQUIRING
         self._samples = 0
         self._rows: list[Sequence[float]] = []  # (phi, t) since the means were taken
-        self._products: Array = np.zeros((4, 4))  # means of (phi, t)(phi, t)'
+        self._products = np.zeros((4, 4))  # means of (phi, t)(phi, t)'
         # Products judged last, the weights of their errors, and the largest sum of squares.
         self._judged, self._weights, self._most = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0
 
@@ -67,25 +59,23 @@ class Agreement:
         size = np.sqrt(np.diag(self._products)[:3])
         if float(size.min()) ** 2 <= LEAST_SQUARE:
             return Status.ACQUIRING
-        scaled = self._products[:3, :3] / np.outer(size, size)
-        eigenvalues, eigenvectors = np.linalg.eigh(scaled)
+        eigenvalues, vectors = np.linalg.eigh(self._products[:3, :3] / np.outer(size, size))
         least = float(eigenvalues[0])
         # No more than the rounding of the sums: the samples do not tell one theta from all others.
         if least <= 1e-12 * float(eigenvalues[-1]):
             return Status.ACQUIRING
         most = 0.1**2 * float((theta[1] * size[1]) ** 2 + (theta[2] * size[2]) ** 2)
         if self._mean_square(np.array(theta)) <= least * most:
-            self._judged, self._most = theta, most
-            self._weights = tuple(size.tolist())
+            self._judged, self._most, self._weights = theta, most, tuple(size.tolist())
             return Status.TRACKING
         # With R = Q diag(l) Q' this is R^-1, positive definite whatever rounding does to R.
-        inverse = (eigenvectors / eigenvalues) @ eigenvectors.T
+        inverse = (vectors / eigenvalues) @ vectors.T
         best = inverse @ (self._products[:3, 3] / size) / size
         variance = self._mean_square(best) * float(inverse[0, 0])
         deviation = sqrt(variance / min(self._samples, MEMORY)) / float(size[0])
         return Status.INCONSISTENT if float(best[0]) < -5.0 * deviation else Status.ACQUIRING
 
-    def _mean_square(self, theta: Array) -> float:
+    def _mean_square(self, theta: NDArray[np.float64]) -> float:
         """Mean of (t - theta' phi)^2."""
         weights = np.append(-theta, 1.0)
         return max(float(weights @ self._products @ weights), 0.0)

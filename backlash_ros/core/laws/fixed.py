@@ -1,8 +1,4 @@
-"""No learning: a backlash measured by hand, or none, is taken as it is.
-
-The state of G comes from a Kalman filter that knows the backlash and allows for a slow
-disturbance d of u, which takes up what the fixed constants get wrong.
-"""
+"""No learning: a backlash measured by hand, or none, is taken as it is."""
 
 from __future__ import annotations
 
@@ -15,42 +11,37 @@ from numpy.typing import NDArray
 from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.law import Interval, Law
 from backlash_ros.core.plant.backlash import Backlash
-from backlash_ros.core.plant.noise_level import NoiseLevel
+from backlash_ros.core.plant.numerics import NoiseLevel
 from backlash_ros.core.plant.transfer_function import StateModel
 
 Array = NDArray[np.float64]
 
 
 class FixedBacklash(Law):
-    """The estimates stay what they are given as; only the state of G is estimated.
+    """Keeps its estimates; a Kalman filter follows the state of G and a slow disturbance d of u.
 
     noise_std: of y; where the innovations show more white noise, that counts. doubt: how much d
-    may move per sample, as a share of the motion of u that the constants predict; 0 trusts them
-    fully.
+    may move per sample, as a share of the motion of u that the constants predict.
     """
 
     adapting = False
+    innovation = nan
 
     def __init__(
         self, initial: Estimate, model: StateModel, noise_std: float, doubt: float,
     ) -> None:
-        self.estimate = replace(
-            initial, std_m=0.0, std_c_r=0.0, std_c_l=0.0, status=Status.TRACKING
-        )
-        self._innovation = nan
+        self.estimate = e = replace(
+            initial, std_m=0.0, std_c_r=0.0, std_c_l=0.0, status=Status.TRACKING)
         n = model.order
         # A gap of exactly 0 has c_l = c_r, which (2.1) does not know: then u = m (v - c).
-        gapless = initial.c_r == initial.c_l
-        self._backlash = None if gapless else Backlash(initial.m, initial.c_r, initial.c_l)
-        self._model = model
+        self._backlash = None if e.c_r == e.c_l else Backlash(e.m, e.c_r, e.c_l)
+        self._model, self._doubt = model, doubt
         self._transition = np.eye(n + 1)
         self._transition[:n, :n], self._transition[:n, n] = model.a, model.b
-        self._doubt = doubt
         self._noise_std, self._noise = max(noise_std, 1e-12), NoiseLevel()
         self._x: Array = np.zeros(n + 1)
         self._p: Array = np.zeros((n + 1, n + 1))
-        self._u = 0.0
-        self._started = False
+        self._u, self._started = 0.0, False
 
     def with_model(self, model: StateModel) -> FixedBacklash:
         """The same for another G, the state of which is not known yet."""
@@ -66,18 +57,11 @@ class FixedBacklash(Law):
         return max(self._noise.std, self._noise_std) ** 2
 
     @property
-    def innovation(self) -> float:
-        """y(k) minus its prediction; nan where y(k) was lost."""
-        return self._innovation
-
-    @property
     def x_hat(self) -> Array:
-        """State of G in the coordinates of StateModel, shape (n,)."""
         return self._x[:-1]
 
     @property
     def x_cov(self) -> Array:
-        """Covariance of x_hat, shape (n, n)."""
         return self._p[:-1, :-1]
 
     def predicted(self, u: float) -> float:
@@ -85,18 +69,14 @@ class FixedBacklash(Law):
         return self._model.c * float(self._transition[0] @ self._x + self._model.b[0] * u)
 
     def update(self, y: float | None, interval: Interval) -> None:
-        """Take in y(k), None if it was lost, and v of the interval before it."""
-        e = self.estimate
-        backlash = self._backlash
-        before = self._u
+        e, backlash, before = self.estimate, self._backlash, self._u
         self._u = e.m * (interval.v - e.c_r) if backlash is None else backlash.step(interval.v)
         x = self._transition @ self._x
         x[:-1] += self._model.b * self._u
         p = self._transition @ self._p @ self._transition.T
         p[-1, -1] += (self._doubt * (self._u - before)) ** 2
-        if y is None:
-            self._innovation = nan
-        else:
+        self.innovation = nan
+        if y is not None:
             if not self._started:
                 # A prior that is wide beside the first output and the noise.
                 x_scale = 1e3 * (abs(y) + self._noise_var**0.5)
@@ -105,10 +85,10 @@ class FixedBacklash(Law):
             c = self._model.c
             cross = c * p[:, 0]
             variance = c * cross[0] + self._noise_var
-            self._innovation = y - c * float(x[0])
-            self._noise.take(self._innovation)
+            self.innovation = y - c * float(x[0])
+            self._noise.take(self.innovation)
             gain = cross / variance
-            x = x + gain * self._innovation
+            x = x + gain * self.innovation
             p -= np.outer(gain, cross)
             p = 0.5 * (p + p.T)
         self._x, self._p = x, p

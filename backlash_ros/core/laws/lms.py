@@ -11,21 +11,17 @@ f follows the gradient of J = E{(u - u_d)^2} (3.6): f(k+1) = f(k) + step_f (u - 
 Reference: S. Haykin, Adaptive Filter Theory, Prentice-Hall 1996, chapter 9 (the paper's [6]).
 """
 
-from __future__ import annotations
-
 from backlash_ros.core.estimate import Bounds, Estimate, Status
 from backlash_ros.core.law import Interval
 from backlash_ros.core.laws.agreement import LEAST_SQUARE
-from backlash_ros.core.laws.input_reconstruction import InputReconstruction
-from backlash_ros.core.laws.lagged_law import LaggedLaw
+from backlash_ros.core.laws.input_reconstruction import InputReconstruction, LaggedLaw
 from backlash_ros.core.parameters import Parameters
 
 
 class NormalisedLms(LaggedLaw):
     """LMS on (m, m c_r, m c_l) and f, fed with u reconstructed from y.
 
-    step: 0 < step < 2. step_f: 0 keeps f. The side comes from the motion of u. Where y moves
-    against v nothing is learned.
+    step: 0 < step < 2. step_f: 0 keeps f. Where y moves against v nothing is learned.
     """
 
     RETUNED = ('lms.step', 'lms.step_f')
@@ -34,32 +30,18 @@ class NormalisedLms(LaggedLaw):
         self, initial: Estimate, bounds: Bounds, f_bounds: tuple[float, float],
         reconstruction: InputReconstruction, step: float = 1.0, step_f: float = 0.0,
     ) -> None:
-        super().__init__(reconstruction)
-        self.estimate = initial
+        super().__init__(initial, bounds, f_bounds, reconstruction)
         self.step, self.step_f = step, step_f
-        self._bounds, self._f_bounds = bounds, f_bounds
         self._v_max = 0.0
 
     def retune(self, p: Parameters) -> None:
-        """Take up new steps."""
         self.step, self.step_f = p.lms.step, p.lms.step_f
 
-    def update(self, y: float | None, interval: Interval) -> None:
-        """Take in y(k) and learn from the sample that the reconstruction has reached."""
-        u, past = self._follow(y, interval)
-        if past is None:
-            return
-        rising = self._rising(u)
-        if rising is None:
-            return
-        if self.estimate.status is Status.INCONSISTENT:
-            self._take(self.estimate, u, past.v, rising)
-        else:
-            self._take(self._learned(u, past, rising), u, past.v, rising)
-
-    def _learned(self, u: float, past: Interval, rising: bool) -> Estimate:
+    def _learned(self, u: float, past: Interval, rising: bool | None) -> Estimate:
         old, v = self.estimate, past.v
-        m, c_r, c_l = old.m, old.c_r, old.c_l
+        if rising is None or old.status is Status.INCONSISTENT:
+            return old
+        m, c_r, c_l, f = old.m, old.c_r, old.c_l, old.f
         self._v_max = max(self._v_max, abs(v))
         e = u - m * (v - (c_r if rising else c_l))
         weight = 1.0 / self._v_max**2 if self._v_max**2 > LEAST_SQUARE else 0.0
@@ -67,9 +49,7 @@ class NormalisedLms(LaggedLaw):
         # Products first: they enter the error linearly, the crossings follow by division.
         product_r = m * c_r - gain if rising else m * c_r
         product_l = m * c_l if rising else m * c_l - gain
-        m, c_r, c_l = self._bounds.of_products(m + gain * weight * v, product_r, product_l)
-        f = old.f
         if self.step_f > 0.0:
             f += self.step_f * (u - past.u_d) * v / (1.0 + v * v)
             f = min(max(f, self._f_bounds[0]), self._f_bounds[1])
-        return Estimate(m, c_r, c_l, f)
+        return Estimate(*self._bounds.of_products(m + gain * weight * v, product_r, product_l), f)

@@ -8,14 +8,11 @@ All four quotients reduce to the one equation e = u - u_d = 0, solved for one un
 One equation cannot identify four unknowns; docs/paper.md says what follows. Use `lms` to learn.
 """
 
-from __future__ import annotations
-
 from math import isfinite, nan
 
-from backlash_ros.core.estimate import Bounds, Estimate
+from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.law import Interval
-from backlash_ros.core.laws.input_reconstruction import InputReconstruction
-from backlash_ros.core.laws.lagged_law import LaggedLaw
+from backlash_ros.core.laws.input_reconstruction import LaggedLaw
 
 
 def printed_f(u: float, y_m: float, m: float, w: float) -> float:
@@ -42,26 +39,12 @@ def printed_c(u: float, y_m: float, f: float, m: float) -> float:
 class PrintedLaw(LaggedLaw):
     """Equations (3.11), evaluated in the printed order with the newest values.
 
-    u is reconstructed from y and therefore `lag` samples old; the law is evaluated for that time.
     Guards: a quotient that is not finite is skipped, the rest is projected into the bounds.
     """
 
-    def __init__(
-        self, initial: Estimate, bounds: Bounds, f_bounds: tuple[float, float],
-        reconstruction: InputReconstruction,
-    ) -> None:
-        super().__init__(reconstruction)
-        self.estimate = initial
-        self.skipped = 0
-        self._bounds, self._f_bounds = bounds, f_bounds
-        self._upward = True
-        self._u_before = 0.0
+    skipped, _upward, _u_before = 0, True, 0.0
 
-    def update(self, y: float | None, interval: Interval) -> None:
-        """Take in y(k) and apply (3.11) to the sample that the reconstruction has reached."""
-        u, past = self._follow(y, interval)
-        if past is None:
-            return
+    def _learned(self, u: float, past: Interval, rising: bool | None) -> Estimate:
         old = self.estimate
         # w is c_r in the upward region, c_l in the downward one, and kept in the gap.
         if u != self._u_before:
@@ -73,9 +56,7 @@ class PrintedLaw(LaggedLaw):
         c = printed_c(u, past.y_m, f, m)
         c_r = self._guarded(c, old.c_r, self._bounds.c_r) if upward else old.c_r
         c_l = old.c_l if upward else self._guarded(c, old.c_l, self._bounds.c_l)
-        self.estimate, rising = Estimate(m, c_r, c_l, f, status=old.status), self._rising(u)
-        if rising is not None:
-            self._take(self.estimate, u, past.v, rising)
+        return Estimate(m, c_r, c_l, f, status=old.status)
 
     def _guarded(self, value: float, old: float, bounds: tuple[float, float]) -> float:
         if not isfinite(value):

@@ -6,8 +6,6 @@ v is where the motor is, as its encoder reports it at the end of an interval. Dr
 load winds the loop up by w before the load moves: until then v stays where it touched the load.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,10 +37,8 @@ class Actuator:
                 'circle', 'the motor comes to rest where the command says',
             )
         if not self.gain > 0.0:
-            raise ParameterError(
-                'actuator.numerator', self.lag.numerator.tolist(),
-                f'has the gain {self.gain:.3g} at rest, must be > 0',
-            )
+            raise ParameterError('actuator.numerator', self.lag.numerator.tolist(),
+                                 f'has the gain {self.gain:.3g} at rest, must be > 0')
 
     @property
     def gain(self) -> float:
@@ -76,15 +72,13 @@ class Motor:
         self._offset = 0.5 * (right - left)
         self._wind_up = 0.5 * (right + left) * actuator.gain  # [v]
         self._a, self._b, _ = actuator.lag.state_space()
-        self._x: Array = np.zeros(actuator.lag.order)
-        self._begun = False
+        self._x: Array = np.zeros(0)
 
     def step(self, command: float, load: float, c_r: float, c_l: float) -> float:
         """Go on by one sample; return v at the end of it. load: u / m, what the gap holds [v]."""
         reached = command - self._offset
-        if not self._begun:
-            self._begun = True
-            at_rest = np.linalg.solve(np.eye(len(self._x)) - self._a, self._b)
+        if not len(self._x):
+            at_rest = np.linalg.solve(np.eye(len(self._b)) - self._a, self._b)
             self._x = np.asarray(at_rest * reached)
         self._x = self._a @ self._x + self._b * reached
         q, w = float(self._x[0]), self._wind_up

@@ -59,9 +59,6 @@ class Backlash:
         return self.u
 
 
-# --- over a record ------------------------------------------------------------------------------
-
-
 def play(v: Array, gap: Array | float, before: Array | float) -> Array:
     """p after each v (N,); before: p before the first. For gaps (H,) and beginnings (H,): (H, N).
 

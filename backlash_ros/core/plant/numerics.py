@@ -1,19 +1,22 @@
-"""Linear filters, Riccati and Lyapunov equations, as SciPy has them, without SciPy.
+"""Linear filters, Riccati and Lyapunov equations, pole placement, and the noise of a signal.
 
-scipy.signal takes a node 0.3 s of its start and 40 MB, scipy.linalg a controller 31 MB that nothing
-else in its process needs. LAPACK's solver for banded triangular systems does the recursion of a
-filter, and is faster for long signals; the equations are solved by doubling.
+scipy.signal takes a node 0.3 s of its start and 40 MB, scipy.linalg 31 MB, so that the equations
+are solved here, by doubling.
 
 Reference: E. K.-W. Chu, H.-Y. Fan, W.-W. Lin, C.-S. Wang, Structure-preserving algorithms for
 periodic discrete-time algebraic Riccati equations, Int. J. Control 77 (2004) 767-788.
 """
 
-from __future__ import annotations
-
+from bisect import bisect_left, insort
+from collections import deque
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from backlash_ros.core.parameters import ParameterError
+from backlash_ros.core.plant.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
 
@@ -41,11 +44,9 @@ def lfilter(
         return y
     from scipy.linalg import lapack  # where it is needed: 31 MB
 
-    # The lower band of a triangular matrix, a column per sample.
+    # The recursion is a triangular system: its lower band, a column per sample.
     band = np.repeat(np.array(poles)[:, np.newaxis], count, axis=1)
-    rows = y.reshape(-1, count)
-    solved, failed = lapack.dtbtrs(band, rows.T, uplo='L', diag='U', overwrite_b=1)
-    assert failed == 0
+    solved, _ = lapack.dtbtrs(band, y.reshape(-1, count).T, uplo='L', diag='U', overwrite_b=1)
     return np.ascontiguousarray(solved.T).reshape(y.shape)
 
 
@@ -75,3 +76,97 @@ def riccati(a: Array, b: Array, q: Array) -> Array:
 def lyapunov(a: Array, q: Array) -> Array:
     """P = A P A' + Q for a stable A, shape (n, n); raises numpy.linalg.LinAlgError for another."""
     return riccati(a.T, np.zeros(len(a)), q)
+
+
+class FourBlocks(NamedTuple):
+    """Gains of the four-block structure of Tao and Kokotović, and what they make of the loop.
+
+        u_d = theta_1' w_1 + theta_2' w_2 + theta_20 y + theta_3 r
+        w_1 = a(z)/Lambda(z) u_d,   w_2 = a(z)/Lambda(z) y,   a = (z^(n-2), ..., z, 1)'
+
+    filter: Lambda, shape (n,). reference: theta_3 B/A_m from r to y. disturbance: W from u - u_d
+    to y. returned: B R/(Lambda A_m), so that y + returned y = W u whatever makes u. demand:
+    theta_3 A/A_m from r to u_d, coefficients of numerator and denominator.
+    """
+
+    theta_1: Array
+    theta_2: Array
+    theta_20: float
+    theta_3: float
+    filter: Array
+    reference: TransferFunction
+    disturbance: TransferFunction
+    returned: TransferFunction
+    demand: tuple[Array, Array]
+
+
+def place_poles(model: TransferFunction, closed: Array, filter_pole: float) -> FourBlocks:
+    """Gains for A_m = closed, shape (n + 1,) and monic, and Lambda = (z - filter_pole)^(n-1).
+
+    With G = B/A, S = Lambda - theta_1' a and R = theta_2' a + theta_20 Lambda they solve
+
+        A S - B R = Lambda A_m
+
+    so that y = theta_3 B/A_m r + W (u - u_d) with W = B S/(Lambda A_m), and no zero of G is
+    cancelled. theta_3 gives unit gain at z = 1. Raises ParameterError where numerator and
+    denominator of G have a common factor or nearly so, or G has a zero at z = 1.
+    """
+    n, a, b = model.order, model.denominator, model.numerator[1:]
+    placed = np.atleast_1d(np.poly(np.full(n - 1, filter_pole)))
+    # Sylvester matrix: columns are A and -B shifted by the unknown coefficients of S and R.
+    sylvester = np.zeros((2 * n - 1, 2 * n - 1))
+    for i in range(n - 1):
+        sylvester[i:i + n + 1, i] = a[:2 * n - 1 - i]
+    for i in range(n):
+        sylvester[i:i + n, n - 1 + i] = -b
+    product = np.convolve(placed, closed)
+    known = np.convolve(a, np.eye(1, n)[0])  # S is monic: A z^(n-1) is on the left already
+    right = (product - known)[1:]
+    unknown = np.linalg.lstsq(sylvester, right, rcond=None)[0]
+    residual = float(np.linalg.norm(sylvester @ unknown - right))
+    dc_gain = float(np.sum(b))
+    if not residual <= 1e-6 * float(np.linalg.norm(product)) or dc_gain == 0.0:
+        raise ParameterError(
+            'structure', 'pole_placement', 'cannot place the poles of this G(z)',
+            'cancel its common factors or take structure: tracking',
+        )
+    s, r = np.concatenate([[1.0], unknown[:n - 1]]), unknown[n - 1:]
+    theta_3 = float(np.sum(closed)) / dc_gain
+    return FourBlocks(
+        (placed - s)[1:], (r - r[0] * placed)[1:], float(r[0]), theta_3, placed,
+        TransferFunction((theta_3 * b).tolist(), closed.tolist()),
+        TransferFunction(np.convolve(b, s).tolist(), product.tolist()),
+        TransferFunction(np.convolve(b, r).tolist(), product.tolist()), (theta_3 * a, closed),
+    )
+
+
+class NoiseLevel:
+    """Standard deviation of the white noise in a signal that moves slowly, or in jumps.
+
+    The noise is what the sixth differences show: motion, even with 30 samples per period, leaves
+    1e-4 of its amplitude there. They are sqrt(924) times the noise; the median of the size of a
+    normal variable is 0.6745 of its deviation.
+    """
+
+    def __init__(self) -> None:
+        self._signal: deque[float] = deque(maxlen=7)
+        self._sizes: deque[float] = deque(maxlen=301)
+        self._sorted: list[float] = []
+
+    @property
+    def std(self) -> float:
+        """0 until enough has been seen."""
+        count = len(self._sorted)
+        return 1.0 / (924.0**0.5 * 0.6745) * self._sorted[count // 2] if count >= 15 else 0.0
+
+    def take(self, value: float) -> None:
+        """Take in the next sample."""
+        self._signal.append(value)
+        if len(self._signal) < 7:
+            return
+        a, b, c, d, e, f, g = self._signal
+        size = abs(a - 6.0 * b + 15.0 * c - 20.0 * d + 15.0 * e - 6.0 * f + g)
+        if len(self._sizes) == self._sizes.maxlen:
+            del self._sorted[bisect_left(self._sorted, self._sizes[0])]
+        self._sizes.append(size)
+        insort(self._sorted, size)

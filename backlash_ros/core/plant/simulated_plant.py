@@ -1,19 +1,12 @@
 """The plant the controller does not know in full: backlash, then G(z), then a sensor (3.1).
 
-Its G(z) may differ from the known one as real plants do: in resonance, damping, dead time.
-With the zero-order hold, G(z) without its delay is the sampled response of one G(s),
-x' = A x + b u:
+Its G(z) may differ from the known one, by way of the G(s), x' = A x + b u, that it samples:
 
     exp [A b; 0 0] = [A_z b_z; 0 1]     z = 1 stays an integrator, z = 0 stays a delay
     frequency    G(s / f) / f^k with k integrators: gain at rest, or of the velocity, is kept
-    damping      s^2 + 2 d w s + w^2 with kappa d for d, d >= 1 makes two real poles; the numerator
-                 of G(s), and with it the gain at rest, is kept
+    damping      s^2 + 2 d w s + w^2 with kappa d for d; the numerator of G(s) is kept
     dead time    of u, in front of G: exact for a u that is held over each sample
-
-so that the zeros are those of the altered G(s), sampled.
 """
-
-from __future__ import annotations
 
 import warnings
 from math import sqrt
@@ -24,19 +17,17 @@ from numpy.typing import NDArray
 from backlash_ros.core.parameters import ParameterError, Parameters
 from backlash_ros.core.plant.actuator import Actuator, Motor
 from backlash_ros.core.plant.backlash import Backlash
-from backlash_ros.core.plant.transfer_function import TransferFunction
+from backlash_ros.core.plant.transfer_function import Roots, TransferFunction
 
 Array = NDArray[np.float64]
-Roots = NDArray[np.complex128]
 
 
 class SimulatedPlant:
     """y = G(z) (B[v] + d + w), measured with noise and a quantum.
 
-    d is constant, w a random walk, w(k+1) = w(k) + walk_std sqrt(T) N(0, 1), w(0) = 0. p: has the
-    backlash, its drift and its jump, the noise, d, the walk of u and the seed. model: the true
-    G(z). actuator: what makes v of the command, None where they are one. applied: the newest v.
-    sample: number of the next one.
+    d is constant, w a random walk, w(k+1) = w(k) + walk_std sqrt(T) N(0, 1), w(0) = 0. model: the
+    true G(z). actuator: what makes v of the command, None where they are one. applied: the newest
+    v. sample: number of the next one.
     """
 
     def __init__(
@@ -59,8 +50,8 @@ class SimulatedPlant:
 
     def change(self, p: Parameters) -> None:
         """Go on with other parameters; G(z), the actuator and the walk stay what they are."""
-        hidden = p.backlash
-        self._p, self.backlash = p, Backlash(hidden.m, hidden.c_r, hidden.c_l, self.backlash.u)
+        self._p = p
+        self._wear()
 
     def measure(self) -> float:
         """y(k) as the sensor shows it; call it once per sample."""
@@ -104,10 +95,9 @@ def altered_plant(
 ) -> TransferFunction:
     """The altered G(z); the same numbers where nothing but a whole delay is asked for.
 
-    frequency: factor on the natural frequency of every pole, > 0. damping: factor on the damping
-    ratio of every complex pair of poles, > 0. lag: dead time of u [samples], >= 0. Raises
-    ParameterError for a pole on the negative real axis, which no G(s) of this order has, and for a
-    numerator that is not that of a delay by whole samples.
+    frequency, damping: factors on the natural frequency of every pole and on the damping ratio of
+    every pair, > 0. lag: dead time of u [samples], >= 0. Raises ParameterError for a pole on the
+    negative real axis, which no G(s) of this order has, and for one at 0 that is no delay.
     """
     whole = int(lag + 1e-9)
     part = max(lag - whole, 0.0)
@@ -117,10 +107,7 @@ def altered_plant(
 
     numerator_z, denominator_z, delay = model.without_delay()
     inner = TransferFunction(numerator_z, denominator_z)
-    if inner.denominator[-1] == 0.0:
-        raise _refused(model, 'has poles at 0 that are no delay by whole samples:')
-    poles = _continuous_poles(inner)
-    n = len(poles)
+    poles, n = _continuous_poles(inner), inner.order
     sampled = _block(*inner.state_space()[:2])
     sampled[n, n] = 1.0
     with warnings.catch_warnings():
@@ -130,8 +117,8 @@ def altered_plant(
     poles = _damped(poles, damping) * frequency
     numerator *= frequency**(np.arange(1, n + 1) - np.count_nonzero(poles == 0.0))
     altered = TransferFunction(numerator.tolist(), np.real(np.poly(poles)).tolist())
-    a, b = altered.state_space()[:2]
-    over, over_part = expm(_block(a, b) * (1.0 - part)), expm(_block(a, b) * part)
+    continuous = _block(*altered.state_space()[:2])
+    over, over_part = expm(continuous * (1.0 - part)), expm(continuous * part)
     transition = over[:n, :n] @ over_part[:n, :n]
     denominator = np.real(np.poly(np.exp(poles)))
     b_z = np.append(_numerator(transition, over[:n, n], denominator), 0.0)
@@ -148,10 +135,7 @@ def _block(a: Array, b: Array) -> Array:
 
 
 def _numerator(a: Array, b: Array, denominator: Array) -> Array:
-    """Numerator (n,) of C (z I - A)^-1 b with C = (1, 0, ...), of s as of z.
-
-    The Markov parameters C A^i b times the denominator.
-    """
+    """Numerator (n,) of (1, 0, ...) (z I - A)^-1 b, of s as of z: from the Markov parameters."""
     markov = [b]
     for _ in range(len(a) - 1):
         markov.append(a @ markov[-1])
@@ -160,20 +144,20 @@ def _numerator(a: Array, b: Array, denominator: Array) -> Array:
 
 
 def _continuous_poles(model: TransferFunction) -> Roots:
-    poles = model.poles
+    poles, why = model.poles, ''
     negative = (poles.real < 0.0) & (np.abs(poles.imag) <= 1e-6 * np.abs(poles))
-    if negative.any():
-        raise _refused(model, f'has the pole {float(poles[negative][0].real):.6g}: no continuous '
-                       'plant has poles on the negative real axis, so that')
+    if model.denominator[-1] == 0.0:
+        why = 'has poles at 0 that are no delay by whole samples:'
+    elif negative.any():
+        why = (f'has the pole {float(poles[negative][0].real):.6g}: no continuous plant has poles '
+               'on the negative real axis, so that')
+    if why:
+        raise ParameterError(
+            'plant.denominator', model.denominator.tolist(),
+            f'{why} truth.scale_* and truth.extra_lag cannot alter it',
+            'give truth.numerator and truth.denominator instead')
     # Rounding moves a double pole by 1e-8.
     return np.where(np.abs(poles - 1.0) < 1e-6, 0.0, np.log(poles))
-
-
-def _refused(model: TransferFunction, why: str) -> ParameterError:
-    return ParameterError(
-        'plant.denominator', model.denominator.tolist(),
-        f'{why} truth.scale_* and truth.extra_lag cannot alter it',
-        'give truth.numerator and truth.denominator instead')
 
 
 def _damped(poles: Roots, factor: float) -> Roots:

@@ -1,6 +1,4 @@
-"""The known linear part G(z) = numerator / denominator, and its state space for estimation."""
-
-from __future__ import annotations
+"""The known linear part G(z) = numerator / denominator, its state space, and checks of it."""
 
 from collections.abc import Sequence
 from functools import cached_property
@@ -11,6 +9,9 @@ from numpy.typing import NDArray
 from backlash_ros.core.parameters import ParameterError
 
 Array = NDArray[np.float64]
+Roots = NDArray[np.complex128]
+
+ON_CIRCLE = 1e-6  # distance from the unit circle, from 0, or between two roots, that is none
 
 
 class TransferFunction:
@@ -30,27 +31,21 @@ class TransferFunction:
             raise ParameterError(
                 f'{group}.numerator', list(numerator),
                 f'has degree {len(b) - 1}, must be below the degree {len(a) - 1} of '
-                f'{group}.denominator',
-                'a sampled plant has a delay of at least one sample',
+                f'{group}.denominator', 'a sampled plant has a delay of at least one sample',
             )
         self.numerator = np.concatenate([np.zeros(len(a) - len(b)), b]) / a[0]
         self.denominator = a / a[0]
+        self.order = len(a) - 1
         self._terms = tuple(zip(
-            (-self.denominator[1:]).tolist(), self.numerator[1:].tolist(), strict=True
-        ))
-
-    @property
-    def order(self) -> int:
-        """Number of states n."""
-        return len(self.denominator) - 1
+            (-self.denominator[1:]).tolist(), self.numerator[1:].tolist(), strict=True))
 
     @cached_property
-    def poles(self) -> NDArray[np.complex128]:
+    def poles(self) -> Roots:
         """Roots of the denominator, shape (n,)."""
         return np.asarray(np.roots(self.denominator), dtype=np.complex128)
 
     @property
-    def zeros(self) -> NDArray[np.complex128]:
+    def zeros(self) -> Roots:
         """Roots of the numerator."""
         return np.asarray(np.roots(self.numerator), dtype=np.complex128)
 
@@ -59,7 +54,7 @@ class TransferFunction:
         """Samples between u and its first effect on y."""
         return int(np.flatnonzero(self.numerator)[0])
 
-    def response(self, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    def response(self, z: Roots) -> Roots:
         """G at the points z."""
         value = np.polyval(self.numerator, z) / np.polyval(self.denominator, z)
         return np.asarray(value, dtype=np.complex128)
@@ -69,21 +64,16 @@ class TransferFunction:
 
         The whole delay, as far as the rest is still a G(z) that one can be told.
         """
-        numerator = np.trim_zeros(self.numerator, 'f')
         at_zero = len(self.denominator) - len(np.trim_zeros(self.denominator, 'b'))
         delay = min(at_zero, self.delay - 1)
         denominator = self.denominator[:len(self.denominator) - delay]
-        return numerator.tolist(), denominator.tolist(), delay
+        return np.trim_zeros(self.numerator, 'f').tolist(), denominator.tolist(), delay
 
     def state_space(self) -> tuple[Array, Array, Array]:
-        """Return A (n, n), B (n,), C (n,) of x(k+1) = A x + B u, y = C x in observer form.
-
-        In observer form the first state is y itself.
-        """
+        """A (n, n), B (n,), C (n,) of x(k+1) = A x + B u, y = C x in observer form: x_0 is y."""
         n = self.order
-        a = np.zeros((n, n))
+        a = np.eye(n, k=1)
         a[:, 0] = -self.denominator[1:]
-        a[:-1, 1:] = np.eye(n - 1)
         return a, self.numerator[1:].copy(), np.eye(n)[0]
 
     def advance(self, x: list[float], u: float) -> float:
@@ -103,9 +93,8 @@ class StateModel:
 
     A unit state in any direction then shows with the same energy in y, so that one number tells
     how unknown x is, and covariances stay well scaled however close the poles of G lie to 1.
-    Only the first state shows in y at once: its factor c is all there is of C. memory: samples
-    after which the slowest stable mode has died out. equilibrium: x at rest with y = 1, shape (n,):
-    a constant u holds it, none in an integrator.
+    to_state: from the observer form. memory: samples after which the slowest stable mode has died
+    out. equilibrium: x at rest with y = 1, shape (n,).
     """
 
     def __init__(self, model: TransferFunction) -> None:
@@ -120,13 +109,12 @@ class StateModel:
         r = np.linalg.qr(np.array(rows))[1]
         # A rotation keeps the Gramian and turns C onto the first axis.
         rotation, triangle = np.linalg.qr(np.linalg.solve(r.T, c)[:, None], mode='complete')
-        # From the observer form, whose first state is y.
         self.to_state: Array = np.asarray(rotation.T @ r, np.float64)
         self.to_observer: Array = np.asarray(np.linalg.inv(self.to_state), np.float64)
         self.a: Array = self.to_state @ a @ self.to_observer
         self.b: Array = self.to_state @ b
         self.c = float(triangle[0, 0])
-        stable = [abs(pole) for pole in model.poles if abs(pole) < 1.0 - 1e-6]
+        stable = [abs(pole) for pole in model.poles if abs(pole) < 1.0 - ON_CIRCLE]
         self.memory = memory_of(max(stable, default=0.0))
         rest = np.zeros((n + 1, n + 1))
         rest[:n, :n], rest[:n, n], rest[n, 0] = self.a - np.eye(n), self.b, self.c
@@ -147,14 +135,69 @@ def powers(a: Array, b: Array, count: int) -> Array:
     return stack[:count]
 
 
+def check_model(model: TransferFunction) -> None:
+    """Raise ParameterError where m, c_r, c_l cannot be learned through G, saying why."""
+    poles, numerator = model.poles, model.numerator.tolist()
+    for pole in poles:
+        if abs(pole) > 1.0 + ON_CIRCLE:
+            raise ParameterError(
+                'plant.denominator', model.denominator.tolist(),
+                f'has the unstable pole {_text(pole)}',
+                'close a stabilising loop around the plant first and give its G(z)',
+            )
+    for zero in model.zeros:
+        near = poles[np.abs(poles - zero) < ON_CIRCLE]
+        if near.size and abs(zero) > 1.0 - ON_CIRCLE:
+            raise ParameterError(
+                'plant.numerator', numerator,
+                f'cancels the pole {_text(near[0])}, which then cannot be seen in y',
+                'cancel the common factor in numerator and denominator',
+            )
+        if abs(zero - 1.0) < ON_CIRCLE:
+            raise ParameterError(
+                'plant.numerator', numerator,
+                'has a zero at z = 1: a constant u leaves no trace in y, nor do c_r and c_l',
+                'measure an output that responds to a constant input',
+            )
+
+
+def model_warnings(
+    model: TransferFunction, sample_period: float, frequency: float | None = None,
+) -> list[str]:
+    """Say what makes the estimate ill-conditioned; frequency: of the reference [rad/s] if known."""
+    poles = model.poles
+    slow = [_text(pole) for pole in poles if ON_CIRCLE < 1.0 - abs(pole) < 1e-4]
+    circle = [_text(zero) for zero in model.zeros if abs(abs(zero) - 1.0) < 1e-3]
+    samples = 2.0 * np.pi / (frequency * sample_period) if frequency is not None else 100.0
+    return [text for true, text in (
+        (slow, f'the pole {"".join(slow[:1])} is slower than 10000 samples: sample_period='
+               f'{sample_period:g} s is short for this plant'),
+        (np.count_nonzero(np.abs(poles - 1.0) < 1e-3) > 1,
+         'G(z) integrates more than once: y drifts fast while u is not yet right'),
+        (circle, f'the zero {"".join(circle[:1])} lies on the unit circle: motion of u at that '
+                 'frequency does not show in y'),
+        (np.linalg.cond(StateModel(model).to_observer) > 1e9,
+         'the coefficients of G(z) determine its states badly: give more digits, or a longer '
+         'sample_period'),
+        (not 10.0 <= samples <= 1e5,
+         f'frequency={frequency or 0.0:g} rad/s has {samples:.3g} samples per period, between 10 '
+         'and 100000 are sensible: change sample_period'),
+    ) if true]
+
+
+def _text(root: complex) -> str:
+    return f'{root.real:.6g}' if abs(root.imag) < 1e-9 else f'{root:.6g}'
+
+
 def _polynomial(name: str, coefficients: Sequence[float]) -> Array:
     values = np.asarray(coefficients, dtype=np.float64)
-    if values.ndim != 1 or values.size == 0:
-        raise ParameterError(name, coefficients, 'must be a list of at least one number')
-    if not np.isfinite(values).all():
-        raise ParameterError(name, coefficients, 'must be finite')
-    if not values.any():
-        raise ParameterError(name, coefficients, 'must not be zero')
-    if name.endswith('.denominator') and values[0] == 0.0:
-        raise ParameterError(name, coefficients, 'must have a leading coefficient other than 0')
+    for wrong, rule in (
+        (values.ndim != 1 or values.size == 0, 'must be a list of at least one number'),
+        (not np.isfinite(values).all(), 'must be finite'),
+        (not values.any(), 'must not be zero'),
+        (name.endswith('.denominator') and not values.flat[:1].all(),
+         'must have a leading coefficient other than 0'),
+    ):
+        if wrong:
+            raise ParameterError(name, coefficients, rule)
     return np.trim_zeros(values, 'f')

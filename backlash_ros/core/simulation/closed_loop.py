@@ -1,15 +1,20 @@
-"""The whole loop in one process: reference, controller and simulated plant."""
+"""The whole loop without ROS: reference, controller and simulated plant, or a recorded run.
 
-from __future__ import annotations
+A replay computes its command from every recorded y and y_m. It learns from the v that was recorded:
+the reported one where the loop would have believed it, else the command.
+"""
 
 from array import array
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from backlash_ros.core.assembly import build_controller, build_plant, build_reference
-from backlash_ros.core.control.controller import AdaptiveController
+from backlash_ros.core.control.controller import LONGEST_GAP, AdaptiveController
+from backlash_ros.core.control.limits import plausible
+from backlash_ros.core.loop.command_history import ReportOrigin, ReportTrust, report_use
 from backlash_ros.core.loop.learned_model import learned_model_of
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.simulated_plant import SimulatedPlant
@@ -20,7 +25,7 @@ from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord, row_of
 class ClosedLoop:
     """Controller, plant and reference stepped together; row k holds sample k.
 
-    lose: says of each sample whether y(k) is lost on the way. told: G(z) as the parameters have it.
+    lose: says of each sample whether y(k) is lost on the way. p: G(z) as the parameters have it.
     """
 
     controller: AdaptiveController
@@ -28,7 +33,7 @@ class ClosedLoop:
     reference: Callable[[float], float]
     sample_period: float
     p: Parameters
-    lose: Callable[[], bool] = field(default=lambda: False)
+    lose: Callable[[], bool] = lambda: False
 
     def run(self, samples: int, on_sample: Callable[[int], None] | None = None) -> RunRecord:
         """Simulate and return every signal; on_sample(k) is called after each sample."""
@@ -46,8 +51,7 @@ class ClosedLoop:
                 lost, v = 0, step.v
                 u, truth = self.plant.step(v), self.plant.backlash
                 values.extend(row_of(
-                    t, y, v, u, step, self.controller.estimator, (truth.m, truth.c_r, truth.c_l)
-                ))
+                    t, y, v, u, step, self.controller.estimator, (truth.m, truth.c_r, truth.c_l)))
             if on_sample is not None:
                 on_sample(k)
         return RunRecord(
@@ -59,13 +63,94 @@ class ClosedLoop:
 
 def build_closed_loop(p: Parameters) -> ClosedLoop:
     """The loop of the given parameters; the seed also draws which outputs are lost."""
-    loss = p.output_loss
     rng = np.random.default_rng([p.seed, 1])
     return ClosedLoop(
-        build_controller(p),
-        build_plant(p),
-        build_reference(p),
-        p.sample_period,
-        p,
-        lambda: loss > 0.0 and float(rng.random()) < loss,
+        build_controller(p), build_plant(p), build_reference(p), p.sample_period, p,
+        lambda: p.output_loss > 0.0 and float(rng.random()) < p.output_loss,
+    )
+
+
+def replay(
+    recorded: RunRecord, p: Parameters, on_sample: Callable[[int], None] | None = None,
+    reports: Sequence[Sequence[float]] = (),
+) -> RunRecord:
+    """Feed y, y_m, v and losses of a record to a controller with these parameters.
+
+    The rows are those of the record, with the recorded y, y_m and v, and what this controller makes
+    of them: u_d, estimates, status, innovation. reports: for each row what the driver said to have
+    applied since the row before it. Raises ValueError for rows without numbers and
+    ParameterError for parameters that contradict each other.
+    """
+    t = recorded.column('t')
+    columns = [recorded.column(name).tolist() for name in ('y_m', 'y', 'v')]
+    steps = np.diff(t, prepend=t[:1]) / recorded.sample_period
+    lost = np.maximum(np.round(steps).astype(int) - 1, 0).tolist()
+    controller = build_controller(p)
+    rows = np.full((recorded.samples, len(COLUMNS)), np.nan)
+    trust, origin = ReportTrust(report_use(p)), ReportOrigin()
+    v_before = v_made = 0.0
+    for k, (missing, y_m, y, v) in enumerate(zip(lost, *columns, strict=True)):
+        if not (plausible(y_m) and plausible(y) and plausible(v)):
+            raise ValueError(f't={t[k]:g}: y_m={y_m!r}, y={y!r} and v={v!r} must be finite')
+        if missing > LONGEST_GAP:
+            before, controller = controller, build_controller(p, controller.estimator.estimate)
+            controller.go_on_from(before)
+            missing = 0
+        applied: list[float] = []
+        commands: list[float] = []
+        if k and v_made != v_before:
+            commands = [v_before] * (missing + 1)
+            controller.start_from(v_before)
+        complete = bool(reports) and len(reports[k]) == missing + 1
+        if k and trust.note(complete) and complete:
+            known, scale = controller.estimator.estimate, controller.command_of(1.0)
+            if origin.changed_by(reports[k][-1], v_before / scale, known):
+                # As in the loop: what was learned from them so far goes.
+                before, controller = controller, build_controller(p, origin.before)
+                controller.go_on_from(before)
+                controller.start_from(v_before)
+                missing, commands = 0, []
+            else:
+                applied = [each - origin.value for each in reports[k]]
+        step = controller.step(y, y_m, missing, applied, commands=commands)
+        controller.refine()
+        rows[k] = row_of(t[k], y, v, np.nan, step, controller.estimator)
+        v_before, v_made = v, step.v
+        if on_sample is not None:
+            on_sample(k)
+    for name in ('u', 'true_m', 'true_c_r', 'true_c_l'):  # what no controller can say
+        rows[:, COLUMNS.index(name)] = recorded.column(name)
+    return RunRecord(
+        rows, recorded.sample_period, recorded.lost_samples,
+        learned_model_of(controller.estimator, p),
+    )
+
+
+class Parting(NamedTuple):
+    """Row and time [s] where a replay parts from the run, and the estimate by name and values.
+
+    largest: difference over all rows, in standard deviations where they are known, else relative.
+    """
+
+    sample: int
+    t: float
+    name: str
+    recorded: float
+    replayed: float
+    largest: float
+
+
+def parting(recorded: RunRecord, replayed: RunRecord) -> Parting | None:
+    """Where the estimates differ by a bit for the first time; None where they never do."""
+    first = COLUMNS.index('m')
+    own, again = recorded.rows[:, first:first + 3], replayed.rows[:, first:first + 3]
+    differs = (own != again) & ~np.isnan(own)
+    if not differs.any():
+        return None
+    k, i = (int(index) for index in np.argwhere(differs)[0])
+    std = recorded.rows[:, COLUMNS.index('std_m'):][:, :3]
+    scale = np.where(np.isfinite(std) & (std > 0.0), std, np.maximum(np.abs(own), 1e-300))
+    return Parting(
+        k, float(recorded.column('t')[k]), COLUMNS[first + i], float(own[k, i]),
+        float(again[k, i]), float(np.nanmax(np.where(differs, np.abs(own - again) / scale, 0.0))),
     )

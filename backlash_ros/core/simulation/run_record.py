@@ -1,6 +1,4 @@
-"""The signals of one run, simulated or recorded, a row per sample."""
-
-from __future__ import annotations
+"""The signals of one run, simulated or recorded, a row per sample, and its figures of merit."""
 
 from dataclasses import dataclass
 from math import nan
@@ -14,11 +12,13 @@ from backlash_ros.core.estimates_file import was_given
 from backlash_ros.core.law import Law
 from backlash_ros.core.loop.learned_model import LearnedModel
 
+Array = NDArray[np.float64]
+
 COLUMNS = (
     't', 'y_m', 'y', 'u_d', 'v', 'u', 'm', 'c_r', 'c_l', 'f', 'std_m', 'std_c_r', 'std_c_l',
     'u_hat', 'innovation', 'status', 'true_m', 'true_c_r', 'true_c_l',
 )
-_INDEX = {name: i for i, name in enumerate(COLUMNS)}
+SETTLING_TOLERANCE = 0.01  # of the true value
 
 
 def stated_deviations(e: Estimate) -> tuple[float, float, float]:
@@ -50,14 +50,14 @@ class RunRecord:
     learned: what the controller believed of G at the end, None where it is not known.
     """
 
-    rows: NDArray[np.float64]
+    rows: Array
     sample_period: float
     lost_samples: int = 0
     learned: LearnedModel | None = None
 
-    def column(self, name: str) -> NDArray[np.float64]:
+    def column(self, name: str) -> Array:
         """One signal by name, shape (N,)."""
-        return self.rows[:, _INDEX[name]]
+        return self.rows[:, COLUMNS.index(name)]
 
     @property
     def samples(self) -> int:
@@ -68,3 +68,73 @@ class RunRecord:
     def has_truth(self) -> bool:
         """Whether the true u and backlash are known."""
         return bool(np.isfinite(self.column('true_m')).all()) and self.samples > 0
+
+
+def settling_time(t: Array, estimate: Array, truth: Array) -> float | None:
+    """First time [s] from which the estimate stays within 1 % of the truth; None if never."""
+    # An estimate that is not a number counts as outside.
+    inside = np.abs(estimate - truth) <= SETTLING_TOLERANCE * np.abs(truth)
+    settled = np.logical_and.accumulate(inside[::-1])[::-1]
+    return float(t[settled][0]) if settled.any() else None
+
+
+def control_error_rms(run: RunRecord) -> float | None:
+    """RMS of e = u - u_d (3.4) over the last second [unit of u]; None without the true u."""
+    e = (run.column('u') - run.column('u_d'))[run.column('t') > run.column('t')[-1:] - 1.0]
+    e = e[np.isfinite(e)]
+    return float(np.sqrt(np.mean(e**2))) if e.size else None
+
+
+def delayed_reference(run: RunRecord, delay: int) -> Array:
+    """y_m as it is to be followed: `delay` samples late, and y(0) before, shape (N,).
+
+    Rows of lost samples are missing from a run, so that the delay counts in sample periods.
+    """
+    t, y_m = run.column('t'), run.column('y_m')
+    newest = np.searchsorted(t, t - (delay - 0.5) * run.sample_period, side='right') - 1
+    return np.where(newest >= 0, y_m[np.maximum(newest, 0)], run.column('y')[:1])
+
+
+def delayed_tracking_error_rms(run: RunRecord, delay: int, since: float = 0.0) -> float | None:
+    """RMS of y - y_m(k - delay) over RMS of y_m(k - delay) from time `since` [s] on.
+
+    None for a reference at zero.
+    """
+    rows = run.column('t') >= since
+    reference = delayed_reference(run, delay)[rows]
+    if not np.any(reference):
+        return None
+    error = run.column('y')[rows] - reference
+    return float(np.sqrt(np.mean(error**2) / np.mean(reference**2)))
+
+
+def total_variation(values: Array) -> float:
+    """Way that a signal went, up and down alike."""
+    return float(np.abs(np.diff(values)).sum())
+
+
+def turns(values: Array, least: float) -> int:
+    """How often a signal turned back by more than `least` from its extreme."""
+    count, direction = 0, 0
+    low = high = float(values[0]) if values.size else 0.0
+    for value in values.tolist():
+        low, high = min(low, value), max(high, value)
+        if direction <= 0 and value - low > least:
+            count, direction, high = count + (direction < 0), 1, value
+        elif direction >= 0 and high - value > least:
+            count, direction, low = count + (direction > 0), -1, value
+    return count
+
+
+def gap_crossings_per_reversal(run: RunRecord, since: float = 0.0) -> float | None:
+    """Crossings of the gap by v for each reversal of y_m from time `since` [s] on.
+
+    v crosses the gap where it turns back by more than half of it: one that falls short is
+    counted, and noise within the gap is not. None without a true gap or without a reversal.
+    """
+    rows = run.column('t') >= since
+    gap = (run.column('true_c_r') - run.column('true_c_l'))[rows]
+    reversals = turns(run.column('y_m')[rows], 0.0)
+    if reversals == 0 or not np.all(np.isfinite(gap)) or float(gap.max()) < 1e-6:
+        return None
+    return turns(run.column('v')[rows], 0.5 * float(gap.max())) / reversals

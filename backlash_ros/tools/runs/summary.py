@@ -14,7 +14,7 @@ from backlash_ros.core.estimate import Status
 from backlash_ros.core.parameters import ParameterError, Parameters
 from backlash_ros.core.plant.backlash import Backlash
 from backlash_ros.core.reference.signal import PERIODIC
-from backlash_ros.core.simulation import metrics
+from backlash_ros.core.simulation import run_record
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 from backlash_ros.tools.cli import NOTHING, BrokenOffError, InputError, format_table
@@ -53,11 +53,11 @@ def summarise(
         'final_std': {name: newest[f'std_{name}'] for name in BACKLASH},
         'truth': {name: newest[f'true_{name}'] if run.has_truth else None for name in BACKLASH},
         'settling_time_s': {
-            name: metrics.settling_time(t, run.column(name), run.column(f'true_{name}'))
+            name: run_record.settling_time(t, run.column(name), run.column(f'true_{name}'))
             if run.has_truth else None for name in BACKLASH
         },
-        'control_error_rms': metrics.control_error_rms(run),
-        'tracking_error_rms': metrics.delayed_tracking_error_rms(
+        'control_error_rms': run_record.control_error_rms(run),
+        'tracking_error_rms': run_record.delayed_tracking_error_rms(
             run, reference_delay(parameters), float(t[run.samples // 2])
         ),
         'loop_latency_ms': {
@@ -199,9 +199,10 @@ def followed_reference(run: RunRecord, parameters: Parameters | None) -> tuple[A
     Then both are drawn on one scale.
     """
     delay = reference_delay(parameters)
-    error = metrics.delayed_tracking_error_rms(run, delay, float(run.column('t')[run.samples // 2]))
+    since = float(run.column('t')[run.samples // 2])
+    error = run_record.delayed_tracking_error_rms(run, delay, since)
     close = error is not None and error < 0.5  # of the RMS of the reference
-    return metrics.delayed_reference(run, delay), delay * run.sample_period, close
+    return run_record.delayed_reference(run, delay), delay * run.sample_period, close
 
 
 def estimated_loop(run: RunRecord) -> Array:

@@ -19,13 +19,14 @@ from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
 from backlash_ros.core.reference.signal import ReferenceSignal
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
-from backlash_ros.core.simulation.metrics import (
+from backlash_ros.core.simulation.run_record import (
+    COLUMNS,
+    RunRecord,
     delayed_reference,
     delayed_tracking_error_rms,
     gap_crossings_per_reversal,
     turns,
 )
-from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 
 NO_GAP = {'backlash.c_r': 1e-9, 'backlash.c_l': -1e-9}
 KNOWN = {'estimator.law': 'fixed', 'estimator.initial.m': 1.3}

@@ -15,7 +15,7 @@ from backlash_ros.core.plant.backlash import Region
 from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
 from backlash_ros.core.reference.signal import ReferenceSignal
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
-from backlash_ros.core.simulation.metrics import turns
+from backlash_ros.core.simulation.run_record import turns
 
 Array = NDArray[np.float64]
 PERIOD, GAP = 0.005, 0.9

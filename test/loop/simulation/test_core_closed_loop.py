@@ -7,7 +7,7 @@ from strategies import output_of, paper_example
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.transfer_function import TransferFunction
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
-from backlash_ros.core.simulation.metrics import control_error_rms, settling_time
+from backlash_ros.core.simulation.run_record import control_error_rms, settling_time
 
 
 def test_lms_learns_the_papers_backlash_to_1_percent_within_5_s() -> None:

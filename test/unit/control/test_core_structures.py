@@ -19,7 +19,7 @@ from backlash_ros.core.control.tracking.lq_preview import PreviewGains, preview_
 from backlash_ros.core.control.tracking.reference_window import ReferenceWindow, averages
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.parameters import ParameterError, Parameters
-from backlash_ros.core.plant.four_blocks import place_poles
+from backlash_ros.core.plant.numerics import place_poles
 from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 

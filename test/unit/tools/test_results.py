@@ -12,8 +12,12 @@ from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core.loop.learned_model import LearnedModel
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
-from backlash_ros.core.simulation.metrics import control_error_rms, settling_time
-from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
+from backlash_ros.core.simulation.run_record import (
+    COLUMNS,
+    RunRecord,
+    control_error_rms,
+    settling_time,
+)
 from backlash_ros.tools.cli import InputError
 from backlash_ros.tools.runs import files as results
 from backlash_ros.tools.runs.summary import summarise

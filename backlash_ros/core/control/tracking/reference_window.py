@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.plant.noise_level import NoiseLevel
+from backlash_ros.core.plant.numerics import NoiseLevel
 
 Array = NDArray[np.float64]
 

@@ -20,7 +20,7 @@ from backlash_ros.core.control.tracking.trajectory import IdealTrajectory, Traje
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.law import StateSource
 from backlash_ros.core.plant.backlash import Region
-from backlash_ros.core.plant.noise_level import NoiseLevel
+from backlash_ros.core.plant.numerics import NoiseLevel
 from backlash_ros.core.plant.transfer_function import StateModel
 
 FADING = 0.8  # per sample, of what is handed over
