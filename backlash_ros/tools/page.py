@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Sequence
-from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from string import Template
+from typing import NamedTuple
 
 
-@dataclass(frozen=True)
-class Picture:
+class Picture(NamedTuple):
     """A figure of a page: name of its PNG file, heading, what to see in it (HTML)."""
 
     name: str
@@ -30,10 +29,10 @@ def page(
     and the pictures. folded: heading and text of a last section that opens on a click.
     """
     sections = list(parts)
-    for picture in pictures:
-        heading, data = escape(picture.heading), base64.b64encode(picture.data).decode('ascii')
-        sections.append(f'<h2>{heading}</h2>\n<p>{picture.caption}</p>\n'
-                        f'<img alt="{heading}" src="data:image/png;base64,{data}">')
+    for _, name, caption, data in pictures:
+        heading, coded = escape(name), base64.b64encode(data).decode('ascii')
+        sections.append(f'<h2>{heading}</h2>\n<p>{caption}</p>\n'
+                        f'<img alt="{heading}" src="data:image/png;base64,{coded}">')
     if folded is not None:
         summary, text = map(escape, folded)
         sections.append(f'<details><summary>{summary}</summary><pre>{text}</pre></details>')

@@ -26,9 +26,8 @@ from backlash_ros.tools.batch import combinations
 from backlash_ros.tools.config import parse_setting
 from backlash_ros.tools.records.reading import read_run_or_log
 from backlash_ros.tools.report import REPORT_PAGE, write_report
-from backlash_ros.tools.runs.bag import read_reports
 from backlash_ros.tools.runs.files import Run, result_directory, write_table
-from backlash_ros.tools.runs.read_run import find_bag
+from backlash_ros.tools.runs.read_run import find_bag, read_reports
 from backlash_ros.topics import BACKLASH
 
 

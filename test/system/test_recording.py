@@ -21,7 +21,7 @@ from backlash_ros import topics
 from backlash_ros.bags.reader import BagError, BagReader, message_files
 from backlash_ros.bags.repair import damage
 from backlash_ros.tools import report
-from backlash_ros.tools.runs.bag import read_bag
+from backlash_ros.tools.runs.read_run import read_bag
 
 NODES = ('recorder', 'controller', 'reference', 'plant')
 SAMPLE = topics.SIGNAL_LABELS.index('sample')

@@ -16,7 +16,7 @@ from backlash_ros.core.loop.diagnosis import TROUBLE
 from backlash_ros.core.records.record import Record, RecordError
 from backlash_ros.core.records.rows_to_record import Rows, on_grid, usable, without_turns
 from backlash_ros.core.records.stamps import in_order
-from backlash_ros.tools.runs.bag import choose_namespace, read_topics, topic_ends_like
+from backlash_ros.tools.runs.read_run import choose_namespace, read_topics, topic_ends_like
 
 Messages = tuple[NDArray[np.int64], NDArray[np.float64]]  # stamps [ns] and values
 

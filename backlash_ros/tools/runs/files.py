@@ -10,7 +10,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from itertools import count
-from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -30,11 +29,10 @@ SAMPLE_COLUMNS = (*COLUMNS[:COLUMNS.index('u_hat')], 'status')
 
 @dataclass(frozen=True)
 class Run:
-    """A run that was simulated or recorded.
+    """A run that was simulated or recorded; parameters are None where they are unknown.
 
-    parameters: None where no parameters.yaml stands beside it. latency_s: from the departure of
-    y(k) at the driver to that of v(k) at the controller, shape (N,), nan where unknown; None for
-    a simulation. notes: what the user has to know about the source, a sentence each.
+    latency_s: from the departure of y(k) at the driver to that of v(k) at the controller, shape
+    (N,), nan where unknown; None for a simulation. notes: on the source, a sentence each.
     """
 
     record: RunRecord
@@ -69,16 +67,8 @@ def result_directory(out: Path | None) -> Path:
 
 def write_summary(summary: Mapping[str, Any], path: Path) -> None:
     """Write strict JSON: what is not finite becomes null."""
-    text = json.dumps(_finite_or_null(summary), indent=2, allow_nan=False)
-    write_atomically(path, text + '\n')
-
-
-def _finite_or_null(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _finite_or_null(element) for key, element in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite_or_null(element) for element in value]
-    return None if isinstance(value, float) and not isfinite(value) else value
+    known = json.loads(json.dumps(summary), parse_constant=lambda _: None)
+    write_atomically(path, json.dumps(known, indent=2) + '\n')
 
 
 def write_table(path: Path, header: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
@@ -92,8 +82,8 @@ def write_table(path: Path, header: Sequence[str], rows: Sequence[Sequence[objec
 
 def write_run(run: RunRecord, directory: Path) -> None:
     """Write samples.csv for everyone, and record.npz with all that `report` can draw."""
-    columns = [run.column(name) for name in SAMPLE_COLUMNS]
-    write_table(directory / SAMPLES_FILE, SAMPLE_COLUMNS, np.column_stack(columns).tolist())
+    columns = np.column_stack([run.column(name) for name in SAMPLE_COLUMNS])
+    write_table(directory / SAMPLES_FILE, SAMPLE_COLUMNS, columns.tolist())
     learned = run.learned.fields() if run.learned is not None else {}
     arrays: dict[str, Any] = {f'learned.{label}': values for label, values in learned.items()}
     buffer = io.BytesIO()
@@ -104,20 +94,24 @@ def write_run(run: RunRecord, directory: Path) -> None:
     write_atomically(directory / RECORD_FILE, buffer.getvalue())
 
 
+def _rows_of(names: Sequence[str], cells: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rows of a record from some of its columns; what they lack is unknown."""
+    rows = np.full((len(cells), len(COLUMNS)), np.nan)
+    for name, column in zip(names, cells.T, strict=True):
+        if name in COLUMNS:
+            rows[:, COLUMNS.index(name)] = column
+    return rows
+
+
 def read_record(path: Path) -> RunRecord:
-    """Read record.npz; a column that an older one lacks is unknown. Raises InputError."""
+    """Read record.npz, also an older one with fewer columns; raises InputError."""
     try:
         with np.load(path, allow_pickle=False) as stored:
-            rows = np.full((len(stored['rows']), len(COLUMNS)), np.nan)
-            for name, column in zip(stored['columns'].tolist(), stored['rows'].T, strict=True):
-                if name in COLUMNS:
-                    rows[:, COLUMNS.index(name)] = column
-            fields = {
-                name.removeprefix('learned.'): stored[name].tolist()
-                for name in stored.files if name.startswith('learned.')
-            }
+            fields = {name.removeprefix('learned.'): stored[name].tolist()
+                      for name in stored.files if name.startswith('learned.')}
             return RunRecord(
-                rows, float(stored['sample_period']), int(stored['lost_samples']),
+                _rows_of(stored['columns'].tolist(), stored['rows']),
+                float(stored['sample_period']), int(stored['lost_samples']),
                 from_fields(fields) if fields else None,
             )
     except (OSError, KeyError, ValueError, IndexError, EOFError, zipfile.BadZipFile) as error:
@@ -140,8 +134,7 @@ def read_samples(path: Path, sample_period: float | None = None) -> RunRecord:
         raise InputError(f'{path}: line 1: must be the header {",".join(SAMPLE_COLUMNS)}')
     if cells.shape[1:] != (len(names),):
         raise InputError(f'{path}: must hold rows of {len(names)} numbers')
-    rows = np.full((len(cells), len(COLUMNS)), np.nan)
-    rows[:, [COLUMNS.index(name) for name in names]] = cells
+    rows = _rows_of(names, cells)
     t = rows[:, COLUMNS.index('t')]
     steps = np.diff(t)
     if falls := np.flatnonzero(~(steps > 0.0)).tolist():

@@ -1,31 +1,46 @@
-"""Where runs come from: bags and folders of results, with what stands beside them; simulation."""
+"""Where runs come from: bags and folders of results, with what stands beside them; simulation.
+
+Of a bag: signals, estimates and truth, joined on the number of the sample.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
+from itertools import chain, pairwise
+from math import isnan
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from rosbags.typesys import Stores, get_typestore
 
-from backlash_ros.bags.reader import is_bag
+from backlash_ros import topics
+from backlash_ros.bags.reader import REPAIR_COMMAND, BagError, BagReader, Topic, is_bag
+from backlash_ros.core.loop.learned_model import LearnedModel, from_fields
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.closed_loop import ClosedLoop
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 from backlash_ros.tools.cli import WHOLE_SPAN, BrokenOffError, InputError, Span
 from backlash_ros.tools.config import read_configuration
 from backlash_ros.tools.runs import files
-from backlash_ros.tools.runs.bag import read_bag
 from backlash_ros.tools.runs.files import BAG, CONFIG_FILE, RECORD_FILE, SAMPLES_FILE, Run
+
+Array = NDArray[np.float64]
+Messages = list[tuple[int, Any]]  # with their stamps [ns], in the order of these
+# Messages of an array topic by label, shape (N,) each, and their `stamp` [ns] since the first.
+Table = dict[str, Array]
 
 
 def read_run(
     path: Path, config: Path | None = None, span: Span = WHOLE_SPAN, axis: str = '',
 ) -> Run:
-    """Read a run; raises InputError.
+    """Read a bag, its .mcap or .db3 file, a folder of results, record.npz or samples.csv.
 
-    path: a bag, its .mcap or .db3 file, a folder of results, record.npz or samples.csv. config:
-    parameters of the run; None looks for parameters.yaml beside it. axis: of several.
+    config: None looks for parameters.yaml beside it. axis: of several. Raises InputError.
     """
     if not path.exists():
         raise InputError(f'{path}: does not exist')
@@ -43,11 +58,8 @@ def read_run(
             f'{RECORD_FILE} or {SAMPLES_FILE}'
         )
     record = files.read_record(file) if file.suffix == '.npz' else files.read_samples(file, period)
-    return Run(record if span == WHOLE_SPAN else _cut(record, span), parameters)
-
-
-def _cut(record: RunRecord, span: Span) -> RunRecord:
-    """The rows within the span, their time counted from the first one; raises InputError."""
+    if span == WHOLE_SPAN:
+        return Run(record, parameters)
     t = record.column('t')
     rows = record.rows[(t >= span.from_s) & (t < span.to_s)]
     if not len(rows):
@@ -55,7 +67,7 @@ def _cut(record: RunRecord, span: Span) -> RunRecord:
     rows[:, COLUMNS.index('t')] -= rows[0, COLUMNS.index('t')]
     # G is recorded as it was believed at the end.
     learned = record.learned if t[-1] < span.to_s else None
-    return RunRecord(rows, record.sample_period, record.lost_samples, learned)
+    return Run(replace(record, rows=rows, learned=learned), parameters)
 
 
 def find_bag(path: Path) -> Path | None:
@@ -85,8 +97,266 @@ def run_loop(
         # The controller refuses what is not finite: numpy need not say so as well.
         with np.errstate(over='ignore', invalid='ignore', divide='ignore'):
             return loop.run(samples, on_sample)
-    except OverflowError as error:
-        raise BrokenOffError('the run broke off: a signal grew beyond every number') from error
     except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
-        reason = ' '.join(str(error).split())
+        reason = 'a signal grew beyond every number' if isinstance(error, OverflowError) \
+            else ' '.join(str(error).split())
         raise BrokenOffError(f'the run broke off: {reason}') from error
+
+
+class Content(NamedTuple):
+    """Messages of the wanted topics by recorded name.
+
+    names: of all topics of the bag. damage: what is wrong with it and the cure, '' for nothing.
+    """
+
+    messages: dict[str, Messages]
+    names: set[str]
+    damage: str
+
+
+def read_topics(path: Path, wanted: Callable[[Topic], bool]) -> Content:
+    """Decode the wanted topics of a bag, or what is left of them; raises InputError."""
+    types = get_typestore(Stores.ROS2_JAZZY)
+    found: dict[str, Messages] = {}
+    garbled, damage = 0, ''
+    try:
+        reader = BagReader(path)
+    except BagError as error:
+        raise InputError(str(error)) from None
+    for topic, stamp_ns, raw in reader.messages(wanted):
+        # Whatever damaged bytes make the library stumble over, the message is lost.
+        try:
+            message = types.deserialize_cdr(raw, topic.message_type)
+            found.setdefault(topic.name, []).append((stamp_ns, message))
+        except Exception:
+            garbled += 1
+    for messages in found.values():
+        messages.sort(key=lambda each: each[0])
+    if reader.damage and not reader.topics:
+        raise InputError(f'{path}: {reader.damage}, and nothing of it can be read')
+    if reader.damage or garbled:
+        stamps = [stamp for messages in found.values() for stamp, _ in messages] or [0]
+        unread = f', {garbled} more cannot be decoded' if garbled else ''
+        damage = (
+            f'{path} {reader.damage or "is damaged"}: this is what is left, '
+            f'{sum(map(len, found.values()))} messages of '
+            f'{1e-9 * (max(stamps) - min(stamps)):.1f} s{unread}; once it is not being recorded '
+            f'any more, `{REPAIR_COMMAND} {path}` completes it'
+        )
+    return Content(found, {topic.name for topic in reader.topics}, damage)
+
+
+def choose_namespace(names: Sequence[str], axis: str) -> tuple[str, str]:
+    """One of the topics that end alike, '' for none, and a sentence about the others, or ''.
+
+    axis: the one that is wanted, '' for the first.
+    """
+    axes = [name.strip('/').split('/')[0] for name in names]
+    if axis or not names:
+        return names[axes.index(axis)] if axis in axes else '', ''
+    return names[0], '' if len(names) == 1 else (
+        f'the bag holds {", ".join(names)}: this is {axes[0]}; --axis {axes[1]} chooses another one'
+    )
+
+
+def topic_ends_like(name: str, topic: str) -> bool:
+    """Whether a recorded topic is this one, in whatever namespace."""
+    return f'/{name}'.endswith(f'/{topic}')
+
+
+def read_reports(path: Path, y: Array, axis: str = '') -> list[list[float]]:
+    """What applied_control reported between each output of a run and the one before it.
+
+    y (N,): outputs of the run, by whose values they are found among the messages. Empty where the
+    bag holds no applied_control, or the outputs are not all there. Raises InputError.
+    """
+    heard, _, _ = read_topics(path, lambda topic: topic.message_type == 'std_msgs/msg/Float64')
+    outputs, reports = (heard.get(choose_namespace(
+        sorted(name for name in heard if topic_ends_like(name, topic)), axis,
+    )[0], []) for topic in (topics.PLANT_OUTPUT, topics.APPLIED_CONTROL))
+    stamps: list[int] = []
+    remaining = iter(outputs)
+    for value in y.tolist():
+        found = next((stamp for stamp, message in remaining if message.data == value), None)
+        if found is None:
+            return []
+        stamps.append(found)
+    until = np.searchsorted([stamp for stamp, _ in reports], stamps, side='right').tolist()
+    values = [float(message.data) for _, message in reports]
+    return [[], *(values[a:b] for a, b in pairwise(until))] if values else []
+
+
+def read_bag(
+    path: Path, sample_period: float | None = None, span: Span = WHOLE_SPAN, axis: str = '',
+) -> Run:
+    """Read the run that a bag holds, of a damaged one what is left; its parameters are unknown.
+
+    t = (sample - first) * sample_period; None takes the median distance of the stamps. A gap in
+    the count is a lost sample. Where the controller was restarted, it is what the last one did
+    within the span. axis: of several, '' for the first. Raises InputError.
+    """
+    last_parts = {topic.rpartition('/')[2] for topic in topics.LABELS_OF}
+    content = read_topics(path, lambda topic: topic.name.rpartition('/')[2] in last_parts
+                          and topic.message_type == 'std_msgs/msg/Float64MultiArray')
+    try:
+        found, prefix, notes = _of_axis(content, axis)
+        models = found.pop(topics.MODEL)
+        begin_ns = found[topics.SIGNALS][0][0]
+        tables = [_tabulate(*each, prefix, begin_ns) for each in found.items()]
+        restarted = _choose_section(tables, span)
+        signals, estimates, truth = tables
+        if not signals['stamp'].size:
+            raise InputError('holds no sample between --from and --to')
+        count, of_signals, of_estimates = np.intersect1d(
+            signals['sample'], estimates['sample'], assume_unique=True, return_indices=True
+        )
+        if count.size == 0:
+            raise InputError(f'no sample has both {topics.SIGNALS} and {topics.ESTIMATES}')
+        if sample_period is None:
+            steps = np.diff(signals['stamp'][of_signals]) / np.diff(count)
+            sample_period = 1e-9 * float(np.median(steps)) if steps.size else 0.0
+            if not sample_period > 0.0:
+                raise InputError('its stamps do not show the sample period: give --config')
+            notes.append(f'the sample period of {sample_period:.6g} s was taken from the stamps of '
+                         'the bag, as no parameters were given')
+    except InputError as error:
+        raise InputError('; '.join(filter(None, (f'{path}: {error}', content.damage)))) from None
+    columns = {
+        **_rows(signals, of_signals), **_rows(estimates, of_estimates),
+        't': (count - count[0]) * sample_period,
+    }
+    columns |= _true_columns(columns['v'], count, truth)
+    heard = np.union1d(signals['sample'], estimates['sample'])
+    if heard.size > count.size:
+        notes.append(f'{heard.size - count.size} samples were left out: only one of signals and '
+                     'estimates is in the bag')
+    unknown = np.full(count.size, np.nan)
+    record = RunRecord(
+        np.column_stack([columns.get(name, unknown) for name in COLUMNS]), sample_period,
+        int(heard[-1] - heard[0]) + 1 - heard.size,
+        _newest_model([message for stamp, message in models
+                       if signals['stamp'][0] <= stamp - begin_ns < span.to_s * 1e9], prefix),
+    )
+    notes = [content.damage, *notes, restarted]
+    return Run(record, None, columns['latency_s'], tuple(filter(None, notes)))
+
+
+def _of_axis(content: Content, axis: str) -> tuple[dict[str, Messages], str, list[str]]:
+    """The messages of one axis by topic; the prefix of its labels if it is a joint; notes."""
+    found: dict[str, Messages] = {}
+    prefix, notes = '', list[str]()
+    labels_of = {name: _labels(messages[0][1]) for name, messages in content.messages.items()}
+    for topic, labels in topics.LABELS_OF.items():  # signals first
+        # Nodes that were renamed are known by their labels.
+        names = sorted(
+            name for name, given in labels_of.items() if topic_ends_like(name, topic)
+            or (name.rpartition('/')[2] == topic.rpartition('/')[2] and set(labels) <= set(given))
+        )
+        if topic == topics.SIGNALS and names:
+            joints = list(dict.fromkeys(
+                label.partition('.')[0] for label in labels_of[names[0]] if '.' in label))
+            if joints and axis in ('', *joints):
+                if not axis and joints[1:]:
+                    notes = [f'this is joint {joints[0]}; --axis chooses one of '
+                             f'{", ".join(joints[1:])}']
+                prefix, axis = f'{axis or joints[0]}.', ''
+        name, note = choose_namespace(names, axis)
+        if not name and topic in (topics.SIGNALS, topics.ESTIMATES):
+            of_axis = f' of axis {axis}' if axis else ''
+            raise InputError(f'holds no message of {topic}{of_axis}; its topics are '
+                             f'{", ".join(sorted(content.names)) or "none"}')
+        if note:
+            axis, notes = name.strip('/').split('/')[0], [*notes, note]
+        found[topic] = content.messages.get(name, [])
+    return found, prefix, notes
+
+
+def _labels(message: Any) -> list[str]:
+    return [each.label for each in message.layout.dim]
+
+
+def _tabulate(topic: str, messages: Messages, prefix: str, begin_ns: int) -> Table:
+    """The messages of a topic, of several joints what is about the one with this prefix."""
+    if not messages:  # a real plant does not know its truth
+        return {label: np.empty(0) for label in (*topics.LABELS_OF[topic], 'stamp')}
+    given = _labels(messages[0][1]) or topics.LABELS_OF[topic]
+    if any(len(message.data) != len(given) for _, message in messages):
+        raise InputError(f'{topic} has a message without a value for each label')
+    values = np.array([message.data for _, message in messages], dtype=np.float64).T
+    table = {label.removeprefix(prefix): column for label, column in zip(given, values, strict=True)
+             if label.startswith(prefix)}
+    if missing := sorted(set(topics.LABELS_OF[topic]) - set(table)):
+        raise InputError(f'{topic} lacks {", ".join(missing)}')
+    # A joint that was not answered has a row of nan.
+    answered = ~np.isnan(list(table.values())).all(axis=0)
+    table['stamp'] = np.array([stamp - begin_ns for stamp, _ in messages], dtype=np.float64)
+    return _rows(table, answered if prefix else slice(None))
+
+
+def _rows(table: Table, chosen: Any) -> Table:
+    """The rows that an index or a mask chooses."""
+    return {label: column[chosen] for label, column in table.items()}
+
+
+def _choose_section(tables: list[Table], span: Span) -> str:
+    """Leave in the tables the rows of the span, and of its last run if there are several.
+
+    Returns what was left out in one sentence, '' for nothing.
+    """
+    # In lockstep the stamp is that of the newest tick that the recorder had heard: what belongs to
+    # the first signals may be stamped before them.
+    begin = span.from_s * 1e9 if span.from_s > 0.0 else -np.inf
+    tables[:] = [_rows(table, (table['stamp'] >= begin) & (table['stamp'] < span.to_s * 1e9))
+                 for table in tables]
+    signals, note = tables[0], ''
+    restarts = np.flatnonzero(np.diff(signals['sample']) <= 0) + 1
+    # Where the count falls back that often, two nodes are at work.
+    if restarts.size > 0.1 * signals['sample'].size:
+        note = 'two controllers published at once: the first row of each sample is used'
+    elif restarts.size:
+        cut = signals['stamp'][restarts[-1]]
+        note = (
+            f'the controller restarted its count {restarts.size} time'
+            f'{"s" if restarts.size > 1 else ""}: this is what follows the last restart, '
+            f'{cut * 1e-9:.1f} s after the beginning; --from and --to choose another part'
+        )
+        # Signals by rows, as stamps of a simulated time may be equal.
+        tables[:] = [_rows(signals, slice(restarts[-1], None)),
+                     *(_rows(table, table['stamp'] >= cut) for table in tables[1:])]
+    tables[:] = [_rows(table, np.unique(table['sample'], return_index=True)[1]) for table in tables]
+    return note
+
+
+def _true_columns(v: Array, count: Array, truth: Table) -> Table:
+    """u where it was recorded, and the true backlash, of which the newest holds on.
+
+    The last v of a run is computed but never applied: its sample has no u.
+    """
+    sample = truth['sample']
+    if sample.size == 0:
+        return {}
+    if not np.intersect1d(count, sample).size:
+        # A controller that was started later counts from another beginning: the same v tells.
+        sample_of = dict(zip(truth['v'].tolist(), sample.tolist(), strict=True))
+        offsets = Counter(k - sample_of[value] for k, value in zip(count, v.tolist(), strict=True)
+                          if value in sample_of)
+        sample = sample + max(offsets, key=offsets.__getitem__, default=0)
+    _, here, there = np.intersect1d(count, sample, assume_unique=True, return_indices=True)
+    u = np.full(count.size, np.nan)
+    u[here] = truth['u'][there]
+    newest = np.maximum(np.searchsorted(sample, count, side='right') - 1, 0)
+    return {'u': u, **{f'true_{name}': truth[name][newest] for name in topics.BACKLASH}}
+
+
+def _newest_model(messages: Sequence[Any], prefix: str) -> LearnedModel | None:
+    """The last G that was told, of a joint that was answered; None where it was not complete."""
+    for message in reversed(messages):
+        ends = np.cumsum([each.size for each in message.layout.dim])
+        parts = zip(_labels(message), np.split(message.data, ends), strict=False)
+        fields = {label.removeprefix(prefix): values.tolist() for label, values in parts
+                  if label.startswith(prefix)}
+        if not all(map(isnan, chain(*fields.values()))):
+            with suppress(KeyError, IndexError, ValueError):
+                return from_fields(fields)
+            return None
+    return None

@@ -26,13 +26,31 @@ Array = NDArray[np.float64]
 ESTIMATE_HEADER = ('estimate', 'std', 'truth', 'error', 'within 1 % from')
 
 
+class Part(NamedTuple):
+    """A stretch of a run with a name for it."""
+
+    name: str
+    rows: slice
+
+
+class ErrorCurves(NamedTuple):
+    """Moving RMS of the errors of a loop, shape (N,) each.
+
+    tracking: None where y is not meant to follow y_m.
+    """
+
+    name: str
+    t: Array
+    control: Array
+    tracking: Array | None = None
+
+
 def summarise(
     run: RunRecord, parameters: Parameters | None, latency_s: Array | None = None,
 ) -> dict[str, Any]:
     """Figures of merit of a run, the content of summary.json.
 
-    parameters: None where they are not known. latency_s: of each sample, None for a simulation.
-    Raises InputError for a run without samples.
+    latency_s: of each sample, None for a simulation. Raises InputError for a run without samples.
     """
     if run.samples == 0:
         raise InputError('the run holds no sample that reached the controller')
@@ -40,7 +58,6 @@ def summarise(
     status = status[np.isfinite(status)]
     words = {float(state): state.word for state in Status}
     latency = np.empty(0) if latency_s is None else latency_s[np.isfinite(latency_s)]
-
     newest, learned = dict(zip(COLUMNS, run.rows[-1].tolist(), strict=True)), run.learned
     return {
         'estimator': parameters.estimator.law if parameters else None,
@@ -57,9 +74,7 @@ def summarise(
             if run.has_truth else None for name in BACKLASH
         },
         'control_error_rms': run_record.control_error_rms(run),
-        'tracking_error_rms': run_record.delayed_tracking_error_rms(
-            run, reference_delay(parameters), float(t[run.samples // 2])
-        ),
+        'tracking_error_rms': _tracking_error_rms(run, _reference_delay(parameters)),
         'loop_latency_ms': {
             f'p{q}': 1e3 * float(np.percentile(latency, q)) for q in (50, 99)
         } if latency.size else None,
@@ -86,15 +101,20 @@ def _beginning(run: RunRecord, parameters: Parameters | None) -> dict[str, Any]:
     return {**first, 'from': parameters.estimates.file if loaded else 'estimator.initial'}
 
 
-def reference_delay(parameters: Parameters | None) -> int:
+def _reference_delay(parameters: Parameters | None) -> int:
     """Samples by which y is to follow y_m late, which the structure decides; 0 if unknown."""
     return build_structure(parameters).delay if parameters else 0
 
 
+def _tracking_error_rms(run: RunRecord, delay: int) -> float | None:
+    """Relative, over the last half."""
+    return run_record.delayed_tracking_error_rms(run, delay, float(run.column('t')[run.samples // 2]))
+
+
 def estimate_cells(summary: Mapping[str, Any], name: str) -> tuple[str, ...]:
     """What a summary has on m, c_r or c_l, as the texts below ESTIMATE_HEADER."""
-    final, std = summary['final'][name], summary['final_std'][name]
-    truth, settled = summary['truth'][name], summary['settling_time_s'][name]
+    final, std, truth, settled = (
+        summary[group][name] for group in ('final', 'final_std', 'truth', 'settling_time_s'))
     known = f'{final:.6g}', f'{std:.2g}' if isfinite(std) else NOTHING
     if truth is None:
         return *known, NOTHING, NOTHING, NOTHING
@@ -106,25 +126,6 @@ def estimate_table(summary: Mapping[str, Any], title: str = '') -> str:
     """The estimates of a run as text; title: of the first column."""
     rows = [(name, *estimate_cells(summary, name)) for name in BACKLASH]
     return format_table((title, *ESTIMATE_HEADER), rows)
-
-
-class Part(NamedTuple):
-    """A stretch of a run with a name for it."""
-
-    name: str
-    rows: slice
-
-
-class ErrorCurves(NamedTuple):
-    """Moving RMS of the control error and of the tracking error of a loop, shape (N,) each.
-
-    tracking: None where y is not meant to follow y_m.
-    """
-
-    name: str
-    t: Array
-    control: Array
-    tracking: Array | None = None
 
 
 def control_error(run: RunRecord) -> Array:
@@ -148,8 +149,6 @@ def interesting_parts(run: RunRecord, parameters: Parameters | None) -> tuple[Pa
 
 def moving_rms(values: Array, samples: int) -> Array:
     """RMS of the newest `samples` values at each place, fewer at the start; nan is left out."""
-    if values.size == 0:
-        return values
     known = np.isfinite(values)
     # Each sum from scratch: a running one would keep the rounding errors of large values long past.
     window = np.ones(samples)
@@ -159,24 +158,20 @@ def moving_rms(values: Array, samples: int) -> Array:
     return np.where(count > 0.0, np.sqrt(squares / np.maximum(count, 1.0)), np.nan)
 
 
-def compared_samples(run: RunRecord) -> int:
-    """For how many samples the laws are compared: the run with its lost ones, 10,000 at most."""
-    return min(round(float(run.column('t')[-1]) / run.sample_period) + 1, 10_000)
-
-
 def compare_laws(
     run: RunRecord, parameters: Parameters,
 ) -> tuple[list[ErrorCurves], float, list[str]]:
     """The run's law beside every other one, simulated with the same parameters (Figure 5).
 
-    Also over how long the RMS is taken [s], a period of y_m, and what kept a law from its curve.
+    Over the run with its lost samples, 10,000 samples at most. Also over how long the RMS is taken
+    [s], a period of y_m, and what kept a law from its curve.
     """
-    samples = compared_samples(run)
+    t, own, notes = run.column('t'), parameters.estimator.law, []
+    samples = min(round(float(t[-1]) / run.sample_period) + 1, 10_000)
     window_s = _reference_period(parameters) or 1.0
     window = max(round(window_s / run.sample_period), 1)
-    compared = run.column('t') < (samples - 0.5) * run.sample_period
-    own, notes = parameters.estimator.law, []
-    curves = [ErrorCurves(f'{own} (this run)', run.column('t')[compared],
+    compared = t < (samples - 0.5) * run.sample_period
+    curves = [ErrorCurves(f'{own} (this run)', t[compared],
                           moving_rms(control_error(run)[compared], window))]
     for law in LAWS:
         if law == own or not law_fits(law, parameters.structure):
@@ -198,16 +193,15 @@ def followed_reference(run: RunRecord, parameters: Parameters | None) -> tuple[A
 
     Then both are drawn on one scale.
     """
-    delay = reference_delay(parameters)
-    since = float(run.column('t')[run.samples // 2])
-    error = run_record.delayed_tracking_error_rms(run, delay, since)
+    delay = _reference_delay(parameters)
+    error = _tracking_error_rms(run, delay)
     close = error is not None and error < 0.5  # of the RMS of the reference
     return run_record.delayed_reference(run, delay), delay * run.sample_period, close
 
 
 def estimated_loop(run: RunRecord) -> Array:
     """u = B[v] as the last estimates see it, for the v of the run, shape (N,)."""
-    m, c_r, c_l = (float(run.column(name)[-1]) for name in ('m', 'c_r', 'c_l'))
+    m, c_r, c_l = (float(run.column(name)[-1]) for name in BACKLASH)
     if c_l >= c_r:
         return m * (run.column('v') - c_r)  # no gap left, and then no backlash to simulate
     backlash = Backlash(m, c_r, c_l)

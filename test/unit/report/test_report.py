@@ -29,9 +29,8 @@ from backlash_ros.tools import replay as replay
 from backlash_ros.tools import report as report
 from backlash_ros.tools.config import write_config
 from backlash_ros.tools.records.reading import read_record
-from backlash_ros.tools.runs.bag import read_bag
 from backlash_ros.tools.runs.files import Run
-from backlash_ros.tools.runs.read_run import read_run
+from backlash_ros.tools.runs.read_run import read_bag, read_run
 from backlash_ros.tools.runs.summary import compare_laws, followed_reference, moving_rms, summarise
 
 

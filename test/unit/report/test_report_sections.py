@@ -13,9 +13,8 @@ from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.tools import report as report
 from backlash_ros.tools.cli import Span
-from backlash_ros.tools.runs.bag import read_bag
 from backlash_ros.tools.runs.files import Run
-from backlash_ros.tools.runs.read_run import read_run
+from backlash_ros.tools.runs.read_run import read_bag, read_run
 
 PERIOD_NS = 10_000_000
 START_NS = 10**18
