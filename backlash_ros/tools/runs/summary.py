@@ -108,7 +108,8 @@ def _reference_delay(parameters: Parameters | None) -> int:
 
 def _tracking_error_rms(run: RunRecord, delay: int) -> float | None:
     """Relative, over the last half."""
-    return run_record.delayed_tracking_error_rms(run, delay, float(run.column('t')[run.samples // 2]))
+    half = float(run.column('t')[run.samples // 2])
+    return run_record.delayed_tracking_error_rms(run, delay, half)
 
 
 def estimate_cells(summary: Mapping[str, Any], name: str) -> tuple[str, ...]:
