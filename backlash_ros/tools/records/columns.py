@@ -33,13 +33,11 @@ PATTERNS: Mapping[str, Sequence[str]] = {
 OTHERS = r'.*\b(qd|dq|speed|velocity|vel|(load|current)(?! (pos(ition)?|angle|encoder))|torque' \
          r'|effort|temp(erature)?|voltage|status|moving|err(or)?|acceleration|acc|power|rate' \
          r'|direction|duration)\b.*'
-UNITS_S = {
-    unit: scale for scale, units in {
-        1e-9: 'ns nsec nanoseconds', 1e-6: 'us µs μs usec microseconds micros',
-        1e-3: 'ms msec milliseconds millis', 1.0: 's sec secs seconds', 60.0: 'min minutes',
-        3600.0: 'h hours', 86400.0: 'd days',
-    }.items() for unit in units.split()
-}
+UNITS_S = {unit: scale for scale, units in {
+    1e-9: 'ns nsec nanoseconds', 1e-6: 'us µs μs usec microseconds micros',
+    1e-3: 'ms msec milliseconds millis', 1.0: 's sec secs seconds', 60.0: 'min minutes',
+    3600.0: 'h hours', 86400.0: 'd days',
+}.items() for unit in units.split()}
 
 
 def parse_columns(text: str) -> dict[str, str]:
@@ -66,9 +64,15 @@ def choose_columns(names: Sequence[str], given: Mapping[str, str]) -> tuple[dict
             raise RecordError(f'--columns {role}={name}: {columns_of(names)}')
     found = dict(given)
     for role, meant in (('t', 'the time'), ('v', 'the command'), ('y', 'the output')):
-        fitting = [found[role]] if role in found else _fitting(role, names, found)
-        if not fitting and role != 't':
-            fitting = _left_over(names, found, 'y' if role == 'v' else 'v')
+        if role in found:
+            continue
+        fitting = _fitting(role, names, found)
+        if not fitting and role != 't' and len(names) == 3:
+            # The one of three that is nothing else, nor the other one of v and y.
+            neither = {*found.values(), *_fitting('y' if role == 'v' else 'v', names, found)}
+            left = [name for name in names
+                    if name not in neither and not re.fullmatch(OTHERS, _words(name))]
+            fitting = left if len(left) == 1 else []
         if len(fitting) == 1:
             found[role] = fitting[0]
         elif role != 't' or fitting:
@@ -101,14 +105,6 @@ def _fitting(role: str, names: Sequence[str], taken: Mapping[str, str]) -> list[
     found = ([name for name, text in words.items() if re.fullmatch(pattern, text)
               and (role == 't' or not re.fullmatch(OTHERS, text))] for pattern in PATTERNS[role])
     return next(filter(None, found), [])
-
-
-def _left_over(names: Sequence[str], taken: Mapping[str, str], other: str) -> list[str]:
-    """The one of three columns that is nothing else, nor the other one of v and y; [] for none."""
-    neither = {*taken.values(), *_fitting(other, names, taken)}
-    left = [name for name in names
-            if name not in neither and not re.fullmatch(OTHERS, _words(name))]
-    return left if len(names) == 3 and len(left) == 1 else []
 
 
 def _words(name: str) -> str:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,15 @@ from backlash_ros.tools.runs.read_run import choose_namespace, read_topics, topi
 Messages = tuple[NDArray[np.int64], NDArray[np.float64]]  # stamps [ns] and values
 
 FEWEST_MESSAGES = 3  # that are a motion
+ARRAY = 'std_msgs/msg/Float64MultiArray'
+# What is added to the name of the topic, the joint, and the value of each number of a message.
+NUMBERS_OF: Mapping[str, Callable[[Any], Sequence[tuple[str, str, float]]]] = {
+    'std_msgs/msg/Float64': lambda message: [('', '', message.data)],
+    ARRAY: lambda message: [(f'[{k}]', '', value) for k, value in enumerate(message.data)],
+    'sensor_msgs/msg/JointState': lambda message: [
+        (f'/{joint}', joint, value)
+        for joint, value in zip(message.name, message.position, strict=False)],
+}
 
 
 class Signal(NamedTuple):
@@ -71,9 +80,14 @@ def from_messages(heard: Mapping[str, Messages], period: float | None, of_axis: 
     to sample, None tells it from the stamps. Raises RecordError.
     """
     said, notes = list[str](), list[str]()
-    begin = int(np.median(heard[topics.PLANT_OUTPUT][0]))
-    sent = {topic: _by_time(messages, begin, said) for topic, messages in heard.items()
-            if len(messages[0])}
+    begin_ns = int(np.median(heard[topics.PLANT_OUTPUT][0]))
+    sent = {}  # times [s] and values
+    for topic, (stamps, values) in heard.items():
+        pairs = np.array([(stamps - begin_ns) * 1e-9, values])
+        if len(stamps) >= FEWEST_MESSAGES and np.unique(pairs[0]).size > 1:
+            pairs = pairs[:, in_order(pairs[0], said, 'message')]
+        if len(stamps):
+            sent[topic] = pairs
     t, y = sent.pop(topics.PLANT_OUTPUT)
     commands, v = sent.get(topics.CONTROL), sent.get(topics.APPLIED_CONTROL)
     reported = v is not None and v.shape[1] >= REPORTED * len(t)
@@ -81,8 +95,7 @@ def from_messages(heard: Mapping[str, Messages], period: float | None, of_axis: 
         v, commands = commands, None
     if v is None:
         raise RecordError(f'holds no {topics.CONTROL}{of_axis}: record it as well')
-    rows = Rows(t, v, y, commands, reported)
-    record = on_grid(rows, period, late=True)
+    record = on_grid(Rows(t, v, y, commands, reported), period, late=True)
     step = record.sample_period
     if record.commands is not None:
         record = replace(record, v=without_origin(record.v, record.commands))
@@ -98,18 +111,9 @@ def from_messages(heard: Mapping[str, Messages], period: float | None, of_axis: 
     return usable(replace(record, v=v, y=own), y, said, notes)
 
 
-def _by_time(messages: Messages, begin_ns: int, said: list[str]) -> NDArray[np.float64]:
-    """Times from begin_ns [s] and values, in their order, without those that are none."""
-    pairs = np.array([(messages[0] - begin_ns) * 1e-9, messages[1]])
-    if len(pairs[0]) < FEWEST_MESSAGES or np.unique(pairs[0]).size < 2:
-        return pairs
-    return np.asarray(pairs[:, in_order(pairs[0], said, 'message')])
-
-
 def _native(signals: Mapping[str, Signal], axis: str) -> tuple[dict[str, Messages], str]:
     """The topics of this package by their own names, and which other axes there are."""
-    chosen: dict[str, Messages] = {}
-    about = ''
+    chosen, about = dict[str, Messages](), ''
     for topic in (topics.PLANT_OUTPUT, topics.CONTROL, topics.APPLIED_CONTROL):
         ends = sorted(name for name in signals if topic_ends_like(name, topic))
         name, note = choose_namespace(ends, axis)
@@ -143,23 +147,16 @@ def _joint_pair(
 def _signals(path: Path) -> tuple[dict[str, Signal], str]:
     """Every number of a bag that may be v or y, by name, and what is wrong with the bag."""
     def is_command(topic: str) -> bool:
-        return any(word in topic.lower() for word in (
-            'command', 'cmd', 'goal', 'target', 'setpoint'))
+        words = ('command', 'cmd', 'goal', 'target', 'setpoint')
+        return any(word in topic.lower() for word in words)
 
-    content = read_topics(path, lambda topic: topic.message_type in (
-        'std_msgs/msg/Float64', 'sensor_msgs/msg/JointState') or (
-        topic.message_type == 'std_msgs/msg/Float64MultiArray' and is_command(topic.name)))
+    content = read_topics(path, lambda topic: topic.message_type in NUMBERS_OF and (
+        topic.message_type != ARRAY or is_command(topic.name)))
     series: dict[tuple[str, bool, str], list[tuple[int, float]]] = {}
     for topic, messages in sorted(content.messages.items()):
-        name, commanded = topic.removeprefix('/'), is_command(topic)
         for stamp, message in messages:
-            numbers: Iterable[tuple[str, str, float]] = [('', '', getattr(message, 'data', 0.0))]
-            if hasattr(message, 'name'):
-                numbers = ((f'/{joint}', joint, value) for joint, value in zip(
-                    message.name, message.position, strict=False))
-            elif hasattr(message, 'layout'):
-                numbers = ((f'[{place}]', '', value) for place, value in enumerate(message.data))
-            for part, joint, value in numbers:
-                series.setdefault((name + part, commanded, joint), []).append((stamp, float(value)))
+            for part, joint, value in NUMBERS_OF[message.__msgtype__](message):
+                signal = topic.removeprefix('/') + part, is_command(topic), joint
+                series.setdefault(signal, []).append((stamp, float(value)))
     return {name: Signal(as_messages(pairs), commanded, joint)
             for (name, commanded, joint), pairs in series.items()}, content.damage

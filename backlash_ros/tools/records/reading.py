@@ -14,8 +14,8 @@ from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 from backlash_ros.tools.cli import WHOLE_SPAN, InputError, Span
 from backlash_ros.tools.config import effective_parameters
 from backlash_ros.tools.records.columns import COMMAND, choose_columns
-from backlash_ros.tools.records.table import Table, read_table
-from backlash_ros.tools.runs.files import RECORD_FILE, SAMPLE_COLUMNS, SAMPLES_FILE, Run
+from backlash_ros.tools.records.table import read_table
+from backlash_ros.tools.runs.files import SAMPLE_COLUMNS, Run
 
 NO_COLUMNS: Mapping[str, str] = {}
 
@@ -32,16 +32,24 @@ def read_record(
     if not path.exists():
         raise InputError(f'{path}: does not exist')
     try:
-        record = _read(path, period, axis, columns)
+        record = _from_table(path, period, columns) if _is_table(path) \
+            else _from_run(path, period, axis, columns)
         record = record if span == WHOLE_SPAN else record.between(span.from_s, span.to_s)
     except RecordError as error:
         raise InputError(f'{path}: {error}') from None
     return replace(record, source=str(path))
 
 
-def _read(path: Path, period: float | None, axis: str, columns: Mapping[str, str]) -> Record:
-    if _is_table(path):
-        return _from_table(read_table(path), period, columns)
+def _from_table(path: Path, period: float | None, given: Mapping[str, str]) -> Record:
+    table = read_table(path)
+    chosen, said = choose_columns(table.names, given)
+    t, unit_s = table.times(chosen.pop('t')) if 't' in chosen else (None, None)
+    signals = {role: table.numbers(name) for role, name in chosen.items()}
+    record = record_of(t, signals['v'], signals['y'], period, unit_s, signals.get(COMMAND))
+    return replace(record, notes=(*filter(None, [said]), *table.notes, *record.notes))
+
+
+def _from_run(path: Path, period: float | None, axis: str, columns: Mapping[str, str]) -> Record:
     # What reads bags takes half a second to load.
     from backlash_ros.tools.records.messages import read_bag_record
     from backlash_ros.tools.runs.read_run import find_bag, read_run
@@ -49,25 +57,10 @@ def _read(path: Path, period: float | None, axis: str, columns: Mapping[str, str
     record = None if bag is None else read_bag_record(bag, period, axis, columns)
     if record is not None:
         return record
-    if bag is None and path.is_dir() and not any(
-            (path / name).is_file() for name in (RECORD_FILE, SAMPLES_FILE)):
-        raise RecordError(f'holds no bag, no {RECORD_FILE} and no {SAMPLES_FILE}: give one of '
-                          'them, or a table with t, v and y')
     source = read_run(path, axis=axis)
-    run = source.record
-    if not run.samples:
-        raise RecordError('holds no sample')
-    t, v, y = (run.column(name) for name in 'tvy')
-    record = record_of(t, v, y, period or run.sample_period, 1.0)
+    t, v, y = (source.record.column(name) for name in 'tvy')
+    record = record_of(t, v, y, period or source.record.sample_period, 1.0)
     return replace(record, notes=(*source.notes, *record.notes))
-
-
-def _from_table(table: Table, period: float | None, given: Mapping[str, str]) -> Record:
-    chosen, said = choose_columns(table.names, given)
-    t, unit_s = table.times(chosen.pop('t')) if 't' in chosen else (None, None)
-    signals = {role: table.numbers(name) for role, name in chosen.items()}
-    record = record_of(t, signals['v'], signals['y'], period, unit_s, signals.get(COMMAND))
-    return replace(record, notes=(*filter(None, [said]), *table.notes, *record.notes))
 
 
 def _is_table(path: Path) -> bool:
@@ -102,8 +95,16 @@ def read_run_or_log(
         record = _of_period(path, period, span, axis, columns)
     except InputError as error:
         raise no_run or error from None
-    of_log, applied = _as_run(record)
-    return Run(of_log, parameters, None, (record.timing, *record.notes)), applied
+    known = np.flatnonzero(np.isfinite(record.y))
+    applied = [[], *(part.tolist() for part in np.split(record.v, known)[1:-1])]
+    # A log names no reference, and what is learned does not depend on it.
+    rows = np.full((len(known), len(COLUMNS)), np.nan)
+    rows[:, [COLUMNS.index(name) for name in ('t', 'y_m', 'y', 'v')]] = np.column_stack(
+        [record.sample_period * (known - known[0]), record.y[known], record.y[known],
+         record.v[known]])
+    run_record = RunRecord(
+        rows, record.sample_period, int(known[-1] - known[0] + 1 - len(known)))
+    return Run(run_record, parameters, None, (record.timing, *record.notes)), applied
 
 
 def _is_samples(path: Path) -> bool:
@@ -123,18 +124,3 @@ def _of_period(
         if period is None:
             raise
     return read_record(path, period, span, axis, columns)
-
-
-def _as_run(record: Record) -> tuple[RunRecord, list[list[float]]]:
-    """The run, a row for each reading of y, and the v of every interval before each row.
-
-    y_m is y: a log names no reference, and what is learned does not depend on it.
-    """
-    known = np.flatnonzero(np.isfinite(record.y))
-    rows = np.full((len(known), len(COLUMNS)), np.nan)
-    y = record.y[known]
-    rows[:, [COLUMNS.index(name) for name in ('t', 'y_m', 'y', 'v')]] = np.column_stack(
-        [record.sample_period * (known - known[0]), y, y, record.v[known]])
-    lost = int(known[-1] - known[0] + 1 - len(known))
-    applied = [[], *(part.tolist() for part in np.split(record.v, known)[1:-1])]
-    return RunRecord(rows, record.sample_period, lost), applied

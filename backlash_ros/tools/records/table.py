@@ -13,8 +13,9 @@ import re
 import zlib
 from collections import Counter
 from collections.abc import Sequence
-from itertools import chain, compress
-from operator import not_
+from datetime import date
+from itertools import chain
+from math import nan
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,7 +24,6 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.records.record import RecordError
 from backlash_ros.tools.records.columns import UNITS_S, columns_of, unit_of
-from backlash_ros.tools.records.dates import times_of
 
 Array = NDArray[np.float64]
 
@@ -62,11 +62,11 @@ class Table(NamedTuple):
 
     def numbers(self, name: str, what: str = 'number') -> Array:
         """A column as numbers (N,), nan where there is none; raises RecordError."""
-        not_known = {'', 'nan', 'null', 'none', 'na', 'n/a', '-', '--', 'nil', '?', '#n/a', 'bad',
-                     'missing', 'nat'}
+        unknown = {'', 'nan', 'null', 'none', 'na', 'n/a', '-', '--', 'nil', '?', '#n/a', 'bad',
+                   'missing', 'nat'}
         cells = self.cells[self.names.index(name)]
         values = np.array([_number(cell, self.comma) for cell in cells], dtype=float)
-        broken = [k for k in np.flatnonzero(np.isnan(values)) if cells[k].lower() not in not_known]
+        broken = [k for k in np.flatnonzero(np.isnan(values)) if cells[k].lower() not in unknown]
         if len(broken) > MOST_BROKEN * len(cells):
             raise RecordError(
                 f'column {name!r}: {cells[broken[0]]!r} in row {broken[0] + 1} is no {what}, as in '
@@ -75,10 +75,7 @@ class Table(NamedTuple):
         return values
 
     def by_name(self) -> Table:
-        """The table with a column for each name that stands in a cell, where a row has one value.
-
-        The same table where it is none of names and values.
-        """
+        """With a column for each name that stands in a cell, where a row has one value."""
         columns = dict(zip(self.names, self.cells, strict=True))
         of_values = [name for name in columns
                      if re.fullmatch('.*(value|data|reading)', name.lower())]
@@ -104,6 +101,46 @@ def _number(cell: str, comma: bool) -> float | None:
         return None
 
 
+def times_of(cells: Sequence[str]) -> Array:
+    """Seconds (N,) of dates, or of times of day, all of one zone; nan for what is none.
+
+    Of 3/4/2024 what is the day is told by the whole column.
+    """
+    by_month, by_day = (np.array([_seconds(cell, day_first) for cell in cells])
+                        for day_first in (False, True))
+    known = [each[np.isfinite(each)] for each in (by_month, by_day)]
+    sizes = [(-len(each), np.ptp(each) if len(each) else 0.0) for each in known]
+    return by_day if sizes[1] < sizes[0] else by_month
+
+
+def _seconds(cell: str, day_first: bool) -> float:
+    months = ['jan', 'feb', 'mar', 'apr', 'may', 'jun', 'jul', 'aug', 'sep', 'oct', 'nov', 'dec']
+    text = re.sub(r'( ?Z| UTC|[+-]\d\d:?\d\d)$', '', cell.strip())
+    text = re.sub(r'^(\d{4})(\d\d)(\d\d)[T_ ](\d\d)(\d\d)(\d\d)', r'\1-\2-\3 \4:\5:\6', text)
+    # A date, a time of day, or both.
+    found = re.fullmatch(
+        r'(?:(\d{1,4})([-/. ])(\d{1,2}|[a-z]{3})[a-z]*[-/. ](\d{1,4}))?[t ,]*'
+        r'(?:(?:(\d{1,4}):)?(\d{1,2}):(\d{1,2}(?:[.,:]\d+)?)(?: ?([ap])\.?m\.?)?)?', text.lower())
+    if not text or found is None:
+        return nan
+    a, sign, b, c, hours, minutes, seconds, half = found.groups()
+    if hours is None and seconds is not None and seconds.isdigit():
+        hours, minutes, seconds = minutes, seconds, '0'  # 23:59, but 59:59.9
+    hour = int(hours or 0) % 12 + 12 * (half == 'p') if half else int(hours or 0)
+    time = 3600.0 * hour + 60.0 * int(minutes or 0) + float(re.sub('[,:]', '.', seconds or '0'))
+    if a is None:
+        return time
+    if b in months:
+        b, day_first = str(months.index(b) + 1), True
+    year, month, day = (a, b, c) if len(a) == 4 else \
+        (c, b, a) if day_first or sign == '.' else (c, a, b)
+    try:
+        days = date(int(year) + 2000 * (len(year) < 4), int(month), int(day)).toordinal()
+    except ValueError:
+        return nan
+    return 86400.0 * (days - 719163.0) + time  # since 1970
+
+
 def read_table(path: Path) -> Table:
     """The table of a file; raises RecordError, in one line."""
     try:
@@ -126,33 +163,31 @@ def read_table(path: Path) -> Table:
 
 
 def _from_text(text: str) -> Table:
+    comment = re.compile(r'\s*(?:[#%]|//)[#%/ \t]*')
     lines = [line for line in text.replace('\0', '').replace('−', '-').splitlines()
              if line.strip()]
-    comments = [line.lstrip().startswith(('#', '%', '//')) for line in lines]
-    separator, count = _separator(list(compress(lines, map(not_, comments))))
-    rows = [_split(line.lstrip('#%/ \t') if comment else line, separator)
-            for line, comment in zip(lines, comments, strict=True)]
-    numeric = [_is_numeric(row) for row in rows]
+    bare = [line for line in lines if not comment.match(line)]
+    separator, count = _separator(bare)
+    rows = [_split(line, separator) for line in bare]
     # A last row may be torn; trailing separators may be missing.
-    data = [abs(len(row) - count) <= 1 and number and not comment
-            for row, number, comment in zip(rows, numeric, comments, strict=True)]
+    data = [abs(len(row) - count) <= 1 and _is_numeric(row) for row in rows]
     if not count or not any(data):
         raise RecordError(
             'holds no table: give rows of numbers with t, v and y, separated by , ; or tabs')
     # From the middle of the file upwards: a table may stand below other ones.
     first = min(np.flatnonzero(data).tolist(), key=lambda k: abs(k - len(rows) // 2))
     wide = max(2, sum(map(bool, rows[first])) - 1)
-    heads = [row for row, number in zip(rows[:first], numeric, strict=False)
-             if not number and sum(map(bool, row)) >= wide]
+    commented = [_split(comment.sub('', line, 1), separator)
+                 for line in lines[:lines.index(bare[first])] if comment.match(line)]
+    heads = [row for row in (*commented, *rows[:first])
+             if sum(map(bool, row)) >= wide and not _is_numeric(row)] or [[]]
+    head, units = heads[-1], list[str]()
     # A head that comes again belongs to the same table.
-    head = rows.index(heads[-1]) if heads else -1
-    units: list[str] = []
-    if len(heads) > 1 and rows[head - 1] == heads[-2] and _are_units(rows[head]):
-        units = rows[head]
-        head -= 1
-    names = _told_apart(rows[head] if heads else [], units, count)
-    below = [k for k in range(head + 1, len(rows))
-             if not comments[k] and rows[k] not in (units, rows[head] if heads else None)]
+    at = rows.index(head) if head in rows else -1
+    if at > 0 and rows[at - 1] in heads and _are_units(head):
+        head, units = rows[at - 1], head
+    names = _told_apart(head, units, count)
+    below = [k for k in range(at + 1, len(rows)) if rows[k] not in (head, units)]
     body = [[*rows[k], *[''] * (count - len(rows[k]))][:count] for k in below if data[k]]
     skipped = len(below) - len(body)
     if skipped > max(MOST_BROKEN * len(body), 3.0):
