@@ -28,7 +28,7 @@ from backlash_ros.core.jobs import Executor
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.sample_counter import Output
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.middleware.loopback import prefer_loopback
+from backlash_ros.middleware import prefer_loopback
 from backlash_ros.nodes.controller import ControllerNode
 from backlash_ros.nodes.runtime.executor import PromptExecutor
 from backlash_ros.tools.bringup.environment import free_domain

@@ -5,7 +5,7 @@ import signal
 import sys
 from types import FrameType
 
-from backlash_ros.middleware.installed import ROS_MISSING, ros_is_missing
+from backlash_ros.middleware import ROS_MISSING, ros_is_missing
 
 
 def _end(number: int, frame: FrameType | None) -> None:

@@ -7,12 +7,16 @@ import time
 from collections import deque
 from collections.abc import Mapping
 from concurrent.futures import Future
+from functools import partial
 from itertools import cycle
 from math import isfinite, nan
-from typing import NamedTuple
+from signal import SIGTERM
+from typing import Any
 
 from rclpy.duration import Duration
+from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 from rclpy.subscription import Subscription
+from rclpy.time import Time
 from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock
 
@@ -36,37 +40,29 @@ from backlash_ros.core.loop.sample_counter import (
     Timing,
     kept_outputs,
 )
-from backlash_ros.core.parameters import CONTROLLER, Parameters
+from backlash_ros.core.parameters import CONTROLLER, ParameterError, Parameters
 from backlash_ros.nodes.control.diagnosis import neighbours_of
 from backlash_ros.nodes.control.joint import Joint
 from backlash_ros.nodes.control.publishing import StepPublisher
 from backlash_ros.nodes.control.rivals import RivalWatch
-from backlash_ros.nodes.control.services import offer_services
+from backlash_ros.nodes.control.services import offer_services, refuse_unfit_transitions
 from backlash_ros.nodes.runtime.driver_io import DriverIo, check_style
-from backlash_ros.nodes.runtime.lifecycle import ManagedNode
-from backlash_ros.nodes.runtime.messages import DEPTH, DIAGNOSTICS_PERIOD_S, KEPT_QOS, stamp_ns_of
-from backlash_ros.nodes.runtime.parameters import let_parameters_change
-from backlash_ros.nodes.runtime.process import emit, run
+from backlash_ros.nodes.runtime.messages import DEPTH, DIAGNOSTICS_PERIOD_S, KEPT_QOS
+from backlash_ros.nodes.runtime.process import ProcessNode, emit, run
 
 
-class Pairs(NamedTuple):
-    """Lockstep: ticks of /clock [ns], references and outputs that wait for each other."""
-
-    ticks: deque[int]
-    references: deque[float]
-    outputs: deque[Output]
-
-
-class ControllerNode(ManagedNode):
+class ControllerNode(LifecycleNodeMixin, ProcessNode):
     """Answers every plant_output with a control; estimates and signals follow after it.
 
-    In lockstep the k-th tick of /clock, reference and plant_output belong together, so that
-    runs are repeatable; else the newest reference counts. With `joints` there is a loop for each
-    of them: a message has y of all, and one with v of all answers it.
+    It has the life cycle of ROS 2. In lockstep the k-th tick of /clock, reference and plant_output
+    belong together, so that runs are repeatable; else the newest reference counts. With `joints`
+    there is a loop for each of them: a message has y of all, and one with v of all answers it.
     """
 
     def __init__(self) -> None:
-        super().__init__(CONTROLLER)
+        ProcessNode.__init__(self, CONTROLLER, reconfigurable=True)
+        LifecycleNodeMixin.__init__(self)
+        refuse_unfit_transitions(self)
         p = self.settings
         check_style(p)
         for joint in p.joint_names:
@@ -76,6 +72,7 @@ class ControllerNode(ManagedNode):
             build_controller(own)
             for warning in warnings_of(own, with_reference=False):
                 self.log.warning(f'{joint}: {warning}' if joint else warning)
+        self.active = False
         self.loops: JointLoops | None = None  # None while unconfigured
         # A fit that shared the process of the loop would hold up its commands.
         self._executor: Executor = Executor() if p.lockstep else WorkerExecutor(WORKER_MODULES)
@@ -87,9 +84,9 @@ class ControllerNode(ManagedNode):
         self._counter = SampleCounter(
             p.sample_period, from_zero=not p.lockstep and p.wait_for_subscribers > 0
         )
-        self._pairs = Pairs(deque(), deque(), deque())
+        # Lockstep: ticks of /clock [ns], references and outputs that wait for each other.
+        self._waiting: tuple[deque[int], deque[float], deque[Output]] = deque(), deque(), deque()
         self._around: tuple[Neighbours, Timing] | None = None  # at the newest look at the graph
-        self._news: deque[Joint] = deque()  # of whom there is something new to say
         self._driver: Subscription | None = None  # plant_output, once it may begin
         self._ending: Timer | None = None  # sends the commands of on_timeout
         self.joints: list[Joint] = []
@@ -103,13 +100,11 @@ class ControllerNode(ManagedNode):
             self._on_reference, KEPT_QOS if p.lockstep else 1, polled=not p.lockstep
         )
         self.joints += [Joint(self, name, p.of_joint(name), self._io) for name in p.joint_names]
-        if p.lockstep:
-            self.create_subscription(Clock, topics.CLOCK, self._on_clock, KEPT_QOS)
         offer_services(
             self, lambda: self.configured, self.save_estimates,
             lambda: ', '.join(joint.p.estimates.file for joint in self.joints),
         )
-        let_parameters_change(self, self._check_change, self._take_up, lambda: self.loops is None)
+        self.let_parameters_change(self._check_change, self._take_up, lambda: self.loops is None)
         # One joint at a time: all at once would hold up a command.
         turn = cycle(self.joints)
 
@@ -117,22 +112,23 @@ class ControllerNode(ManagedNode):
             self._steps.look()
             self._diagnose(next(turn))
 
-        self.create_timer(
-            DIAGNOSTICS_PERIOD_S / len(self.joints), look_and_tell, clock=self.steady_clock
-        )
-        if not p.lockstep:
-            self.create_timer(0.1, self._look_for_silence, clock=self.steady_clock)
+        self.every(DIAGNOSTICS_PERIOD_S / len(self.joints), look_and_tell)
+        if p.lockstep:
+            self.create_subscription(Clock, topics.CLOCK, self._on_clock, KEPT_QOS)
+        else:
+            self.every(0.1, self._look_for_silence)
         self._announce()
         if p.autostart:
-            self.start()
+            untyped: Any = self
+            untyped.trigger_configure()
+            untyped.trigger_activate()
 
     def _announce(self) -> None:
         p, to, name = self.settings, self._io.topics, self.resolve_topic_name
-        period = p.sample_period
-        joints = f'joints {", ".join(p.joint_names)}: ' if p.joint_names[0] else ''
+        joints = f'joints {", ".join(p.joint_names)}: ' if p.joints else ''
         self.log.info(
             f'started: {joints}{name(to.output)} and {name(to.reference)} in, {name(to.control)} '
-            f'out, sample_period {period:g} s ({1.0 / period:.4g} Hz); '
+            f'out, sample_period {p.sample_period:g} s ({1.0 / p.sample_period:.4g} Hz); '
             + (f'waits for {to.reference} and {to.output}' if p.autostart
                else 'autostart is false: waits for '
                     f'ros2 lifecycle set {self.get_fully_qualified_name()} configure')
@@ -157,17 +153,22 @@ class ControllerNode(ManagedNode):
 
     # --- the life cycle --------------------------------------------------------------------------
 
-    def configure(self) -> None:
-        before = {joint.name: known_before(joint.p) for joint in self.joints}
-        drivers = {joint.name: joint.driver for joint in self.joints}
-        self.loops = JointLoops(
-            self.settings, self._io.publish, drivers.__getitem__, before, self._counter,
-            {joint.name: joint.v for joint in self.joints}, self._executor,
-        )
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        try:
+            before = {joint.name: known_before(joint.p) for joint in self.joints}
+            drivers = {joint.name: joint.driver for joint in self.joints}
+            self.loops = JointLoops(
+                self.settings, self._io.publish, drivers.__getitem__, before, self._counter,
+                {joint.name: joint.v for joint in self.joints}, self._executor,
+            )
+        except ParameterError as error:  # rclpy itself would swallow it without a word
+            self.log.error(str(error))
+            return TransitionCallbackReturn.FAILURE
         for joint in self.joints:
             joint.begin(self.loops.by_name[joint.name], before[joint.name])
+        return TransitionCallbackReturn.SUCCESS
 
-    def activate(self) -> None:
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         self._rivals.begin(active=True)
         if self._driver is not None:
             # v goes on from the last command, but what the plant did meanwhile is unknown, and
@@ -183,6 +184,8 @@ class ControllerNode(ManagedNode):
                 f'discovery of another controller of {self._rivals.topic} on this machine: '
                 'end that one, or set on_rival: warn',
             )
+        self.active = True
+        return TransitionCallbackReturn.SUCCESS
 
     def _knows_rivals(self) -> bool:
         """Whether no controller of this machine has still to be found that may be in charge."""
@@ -202,38 +205,36 @@ class ControllerNode(ManagedNode):
                      else all(isfinite(loop.heard.y_m_at) for loop in self.configured))
             )
 
+        def listen() -> None:
+            # Whoever is activated twice before everybody is there has two that wait.
+            if self._driver is None:
+                self._rivals.look()
+                self._steps.look()
+                kept = kept_outputs(self.settings.sample_period)
+                self._driver = io.listen(self._on_output, min(kept, DEPTH))
+                emit('ready')
+
         self.call_when(
-            all_there, self._listen_to_driver,
-            f'{io.topics.reference} and the listeners of {io.topics.control}',
+            all_there, listen, f'{io.topics.reference} and the listeners of {io.topics.control}'
         )
 
-    def _listen_to_driver(self) -> None:
-        # Whoever is activated twice before everybody is there has two that wait.
-        if self._driver is None:
-            self._rivals.look()
-            self._steps.look()
-            kept = kept_outputs(self.settings.sample_period)
-            self._driver = self._io.listen(self._on_output, min(kept, DEPTH))
-            emit('ready')
-
-    def deactivate(self) -> None:
+    def on_deactivate(self, state: LifecycleState | None) -> TransitionCallbackReturn:
         """Send the last command as on_stop says, and save what was learned."""
         loops = self.loops
-        assert loops is not None
-        if any(loop.statistics.used for loop in loops.loops):
-            # Before a ramp: whoever stops this process may not wait for its end.
-            self.save_estimates()
-            loops.end(self.settings.on_stop)
-            self._send_last(loops)
-            for joint in self.joints:
-                joint.model.publish_last(loops.by_name[joint.name], joint.p)
-        self._rivals.begin(active=False)
-        self._diagnose()
+        if self.active and loops is not None:
+            self.active = False
+            if any(loop.statistics.used for loop in loops.loops):
+                # Before a ramp: whoever stops this process may not wait for its end.
+                self.save_estimates()
+                loops.end(self.settings.on_stop)
+                self._send_last(loops)
+                for joint in self.joints:
+                    joint.model.publish(loops.by_name[joint.name], joint.p, wait_s=1)
+            self._rivals.begin(active=False)
+            self._diagnose()
+        return TransitionCallbackReturn.SUCCESS
 
-    @property
-    def _step_s(self) -> float:
-        """Between two commands that end the loop."""
-        return max(self.settings.sample_period, 1e-3)
+    on_shutdown = on_deactivate
 
     def _send_last(self, loops: JointLoops) -> None:
         """Send the commands that end all loops; v comes to rest where it takes too long.
@@ -244,7 +245,7 @@ class ControllerNode(ManagedNode):
         deadline, cut_short = told + longest_s, ''
         while loops.send_next():
             if not cut_short:
-                if self.urged:
+                if SIGTERM in self.signals[1:]:
                     cut_short = 'SIGTERM came before it reached zero'
                 elif time.monotonic() + step_s > deadline:
                     cut_short = f'it did not reach zero within timeout.ramp={longest_s:g} s'
@@ -259,15 +260,21 @@ class ControllerNode(ManagedNode):
                 self._diagnose()  # so that who stands down does not take this node for gone
         self._io.publisher.wait_for_all_acked(Duration(nanoseconds=100_000_000))
 
-    def cleanup(self) -> None:
+    @property
+    def _step_s(self) -> float:
+        """Between two commands that end the loop."""
+        return max(self.settings.sample_period, 1e-3)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         for joint in self.joints:
             joint.end()
         self.loops = None
         self._diagnose()
+        return TransitionCallbackReturn.SUCCESS
 
     def finish(self) -> None:
-        super().finish()
-        self._rivals.presence.close()  # nobody has to wait for this node any more
+        self.on_deactivate(None)
+        self._rivals.presence.socket.close()  # nobody has to wait for this node any more
         for joint in self.joints:
             joint.close()
         self._executor.close()
@@ -279,8 +286,8 @@ class ControllerNode(ManagedNode):
             return
         self.loops.take_references(y_m)
         if self.settings.lockstep:
-            self._pairs.references.append(self.loops.by_name[''].heard.y_m)
-            self._answer_pairs()
+            self._waiting[1].append(self.loops.by_name[''].heard.y_m)
+            self._answer_waiting()
 
     def _on_report(self, applied: Mapping[str, float], stamp_ns: int) -> None:
         if self.loops is not None:
@@ -288,16 +295,16 @@ class ControllerNode(ManagedNode):
                 self.loops.by_name[joint].take_applied(v, stamp_ns)
 
     def _on_clock(self, message: Clock) -> None:
-        self._pairs.ticks.append(stamp_ns_of(message))
-        self._answer_pairs()
+        self._waiting[0].append(Time.from_msg(message.clock).nanoseconds)
+        self._answer_waiting()
 
     def _on_output(self, outputs: Mapping[str, Output]) -> None:
         loops = self.loops
         if loops is None or not self.active:
             return
         if self.settings.lockstep:
-            self._pairs.outputs.append(outputs[''])
-            self._answer_pairs()
+            self._waiting[2].append(outputs[''])
+            self._answer_waiting()
         elif self._knows_rivals() or not any(loop.begins for loop in loops.loops):
             self._io.serve_waiting()
             steps = loops.answer(outputs)
@@ -311,10 +318,10 @@ class ControllerNode(ManagedNode):
                     turn.core.refine()
                 self._follow_up(loops, steps)
 
-    def _answer_pairs(self) -> None:
+    def _answer_waiting(self) -> None:
         """Lockstep: answer as soon as tick, reference and output of a sample are there."""
-        loops, (ticks, references, outputs) = self.loops, self._pairs
-        while loops is not None and self.active and all(self._pairs):
+        loops, (ticks, references, outputs) = self.loops, self._waiting
+        while loops is not None and self.active and all(self._waiting):
             # A tick is the sample: messages are not told apart by number then.
             output = outputs.popleft()._replace(stamp_ns=ticks.popleft(), sequence=UNNUMBERED)
             if steps := loops.answer({'': output}, references.popleft()):
@@ -323,12 +330,11 @@ class ControllerNode(ManagedNode):
 
     def _follow_up(self, loops: JointLoops, steps: Mapping[str, ControlStep]) -> None:
         self._steps.publish(loops.by_name, steps)
-        self._news += [
-            joint for joint in self.joints
-            if joint.name in steps and joint.follow(steps[joint.name]) and joint not in self._news
-        ]
-        if self._news:
-            self._diagnose(self._news.popleft())
+        for joint in self.joints:
+            if joint.name in steps:
+                joint.model.follow(loops.by_name[joint.name], joint.p)
+        if news := next((joint for joint in self.joints if joint.told != joint.state), None):
+            self._diagnose(news)
 
     # --- what happens besides --------------------------------------------------------------------
 
@@ -376,11 +382,7 @@ class ControllerNode(ManagedNode):
                 joint.save()
         if loops.give_up_silent():
             if self._ending is None:
-                self._ending = self.create_timer(
-                    self._step_s, self._send_next, clock=self.steady_clock
-                )
-            for joint in self.joints:
-                joint.told = None
+                self._ending = self.every(self._step_s, self._send_next)
             self._diagnose()
 
     def _send_next(self) -> None:
@@ -401,13 +403,11 @@ class ControllerNode(ManagedNode):
                 self._around = (
                     neighbours_of(self, self._io, self.settings, found), self._io.known_of(timing),
                 )
+            joint.told = joint.state
             joint.diagnose(*self._around, rivals.claim, self.active)
 
 
-def main(args: list[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
-    return run(CONTROLLER, ControllerNode, args)
-
+main = partial(run, CONTROLLER, ControllerNode)
 
 if __name__ == '__main__':
     sys.exit(main())

@@ -136,7 +136,7 @@ class FollowedControllers:
         self._diagnostics = node.listen(
             DiagnosticArray, topics.DIAGNOSTICS, self._hear, qos=100, polled=True
         )
-        node.create_timer(1.0, self._look, clock=node.steady_clock)
+        node.every(1.0, self._look)
         self._look()
 
     @property

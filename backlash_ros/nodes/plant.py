@@ -10,6 +10,7 @@ from math import inf, isfinite
 from typing import Any
 
 import numpy as np
+from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
 
@@ -19,9 +20,7 @@ from backlash_ros.core.parameters import PLANT, Parameters
 from backlash_ros.core.scenario import build_plant
 from backlash_ros.nodes.runtime import messages
 from backlash_ros.nodes.runtime.executor import PromptExecutor
-from backlash_ros.nodes.runtime.parameters import let_parameters_change
 from backlash_ros.nodes.runtime.process import ProcessNode, emit, run
-from backlash_ros.nodes.runtime.wire import message_with
 
 
 class PlantTopics:
@@ -51,8 +50,8 @@ class PlantTopics:
     def publish_output(self, y: float, sample: int, time_s: float) -> None:
         """Publish y of a sample, in lockstep after the simulated time."""
         if self._clock is not None:
-            self._clock.publish(messages.clock_message(round(time_s * 1e9)))
-        self._output.publish(message_with(y))
+            self._clock.publish(Clock(clock=Time(nanoseconds=round(time_s * 1e9)).to_msg()))
+        self._output.publish(messages.message_with(y))
         self.outputs, self.newest = self.outputs + 1, sample
 
     def publish_truth(self) -> None:
@@ -85,7 +84,7 @@ class PlantNode(ProcessNode):
         self._counts: Counter[str] = Counter()
         self._published = PlantTopics(self)
         self.listen(Float64, topics.CONTROL, self._on_control, 1)
-        let_parameters_change(self, build_plant, self._take_up)
+        self.let_parameters_change(build_plant, self._take_up)
         name, outputs = self.resolve_topic_name, topics.PLANT_OUTPUT
         wanted = p.wait_for_subscribers
         self.log.info(
@@ -180,7 +179,7 @@ class PlantNode(ProcessNode):
         u = plant.step(v)
         truth = plant.backlash
         self._published.truth_rows.append((u, truth.m, truth.c_r, truth.c_l, v, float(sample)))
-        self._published.applied.publish(message_with(plant.applied))
+        self._published.applied.publish(messages.message_with(plant.applied))
 
     def _publish_output(self, latest_ns: float = inf) -> bool:
         """Measure y, and publish it unless it is lost on purpose or too late."""

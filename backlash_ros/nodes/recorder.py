@@ -16,6 +16,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
+from rclpy.time import Time
 from rosbags.interfaces import Connection
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray
@@ -87,7 +88,7 @@ class RecorderNode(ProcessNode):
         if p.lockstep:
             self.create_subscription(Clock, topics.CLOCK, self._on_clock, RECORDER_DEPTH)
         if ENABLED:
-            self.create_timer(0.2, self._tell, clock=self.steady_clock)
+            self.every(0.2, self._tell)
         # Lockstep promises every row: that of the first truth leaves as soon as y is subscribed to.
         truth = (topics.TRUTH,) if p.lockstep else ()
         wanted = (topics.ESTIMATES, topics.SIGNALS, *truth, to.reference, to.control)
@@ -152,9 +153,9 @@ class RecorderNode(ProcessNode):
             # The log has it already.
             diagnostics.publish(finding, {'reason': self.failure}, logs=False)
 
-        self.create_timer(messages.DIAGNOSTICS_PERIOD_S, diagnose, clock=self.steady_clock)
+        self.every(messages.DIAGNOSTICS_PERIOD_S, diagnose)
         # A crash or a power cut costs half a second, with the time that a flush takes.
-        self.create_timer(0.4, lambda: self._with_bag(Bag.flush), clock=self.steady_clock)
+        self.every(0.4, lambda: self._with_bag(Bag.flush))
         return bag
 
     def _with_bag(self, action: Callable[[Bag], None]) -> bool:
@@ -208,7 +209,7 @@ class RecorderNode(ProcessNode):
             self._first_signals = self._first_signals or message
 
     def _on_clock(self, message: Clock) -> None:
-        self._now_ns = messages.stamp_ns_of(message)
+        self._now_ns = Time.from_msg(message.clock).nanoseconds
 
     def _tell(self) -> None:
         """Say how the run is going, of its first joint if it has several."""

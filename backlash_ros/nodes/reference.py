@@ -10,6 +10,7 @@ from math import inf
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
 
@@ -22,9 +23,7 @@ from backlash_ros.core.scenario import build_reference
 from backlash_ros.nodes.runtime import messages
 from backlash_ros.nodes.runtime.driver_io import DriverIo
 from backlash_ros.nodes.runtime.executor import PromptExecutor, serve_polled
-from backlash_ros.nodes.runtime.parameters import let_parameters_change
 from backlash_ros.nodes.runtime.process import ProcessNode, emit, run
-from backlash_ros.nodes.runtime.wire import message_with
 
 
 class ReferenceNode(ProcessNode):
@@ -47,7 +46,7 @@ class ReferenceNode(ProcessNode):
         self._output = self.create_publisher(
             Float64, topics.REFERENCE, messages.KEPT_QOS if p.lockstep else messages.DEPTH
         )
-        let_parameters_change(self, build_reference, self._take_up)
+        self.let_parameters_change(build_reference, self._take_up)
         name, listeners = self.resolve_topic_name, p.wait_for_subscribers
         self.log.info(
             f'started: {name(self._io.topics.output)} in, {name(topics.REFERENCE)} out: '
@@ -144,13 +143,14 @@ class ReferenceNode(ProcessNode):
             self._offset_s = 0.0
 
     def _on_clock(self, message: Clock) -> None:
-        self._publish(round(messages.stamp_ns_of(message) * 1e-9 / self.settings.sample_period))
+        time_s = Time.from_msg(message.clock).nanoseconds * 1e-9
+        self._publish(round(time_s / self.settings.sample_period))
 
     def _publish(self, sample: int) -> None:
         # The same product as in a simulation in one process, so that runs agree to the last bit.
         self._newest = sample
         y_m = self._signal(sample * self.settings.sample_period + self._offset_s)
-        self._output.publish(message_with(y_m))
+        self._output.publish(messages.message_with(y_m))
 
 
 main = partial(run, REFERENCE_NODE, ReferenceNode)

@@ -16,7 +16,7 @@ import rclpy
 from rclpy.context import Context
 from rclpy.node import Node
 
-from backlash_ros.middleware.loopback import prefer_loopback
+from backlash_ros.middleware import prefer_loopback
 from backlash_ros.nodes.runtime.executor import PromptExecutor
 from backlash_ros.tools.bringup.environment import child_environment, free_domain
 from backlash_ros.tools.bringup.supervisor import Child, ProcessSupervisor

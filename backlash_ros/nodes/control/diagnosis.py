@@ -72,13 +72,9 @@ def missing_joint(io: DriverIo, joint: str, p: Parameters) -> list[Finding]:
 
 def details_of(findings: list[Finding], around: Neighbours) -> dict[str, object]:
     """All findings, and who is on the topics where that matters."""
-    details: dict[str, object] = {
-        f'finding {i}': finding.text for i, finding in enumerate(findings, start=1)
-    }
-    for topic, what in zip(
-        around[:3], ('published by', 'published by', 'heard by'), strict=True
-    ):
-        details[f'{topic.name} {what}'] = ', '.join(
+    details: dict[str, object] = {f'finding {i}': each.text for i, each in enumerate(findings, 1)}
+    for topic, what in zip(around[:3], ('published', 'published', 'heard'), strict=True):
+        details[f'{topic.name} {what} by'] = ', '.join(
             peer.name + (f' ({peer.kind}: does not fit)' if peer.unfit else '')
             for peer in topic.peers
         ) or 'nobody'

@@ -10,7 +10,6 @@ from math import isfinite
 from pathlib import Path
 
 from backlash_ros.core.assembly import build_controller, first_guess
-from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.estimates_file import save_estimate, worth_saving
 from backlash_ros.core.loop.control_loop import ControlLoop, Driver
@@ -36,8 +35,8 @@ class Joint:
     """What the controller has of each joint; a single one is nameless.
 
     p: its parameters. loop: None while the node is unconfigured. v: the command that acts as far as
-    this node can know, None if it cannot. told: what /diagnostics has, None where it is to be told
-    anew. saved_at: when estimates were saved last, on the steady clock [s].
+    this node can know, None if it cannot. told: the state that /diagnostics has. saved_at: when
+    estimates were saved last, on the steady clock [s].
     """
 
     def __init__(self, node: ProcessNode, name: str, p: Parameters, io: DriverIo) -> None:
@@ -71,6 +70,11 @@ class Joint:
             io.now_ns, lambda: io.has_reports and not io.is_simulated, io.topics.applied, warn_once
         )
 
+    @property
+    def state(self) -> object:
+        """Of which every change is worth a message in /diagnostics."""
+        return self.loop and (self.loop.phase, self.loop.estimate.status)
+
     def begin(self, loop: ControlLoop, before: Estimate) -> None:
         """Take a new loop."""
         self.loop = loop
@@ -89,20 +93,11 @@ class Joint:
                 self.v = self.loop.v
         self.loop = None
 
-    def follow(self, step: ControlStep) -> bool:
-        """Tell of a step; returns whether there is something new to say in /diagnostics."""
-        loop = self.loop
-        assert loop is not None
-        self.model.follow(loop, self.p)
-        before, self.told = self.told, (loop.phase, step.estimate.status)
-        return self.told != before
-
     def check_change(self, p: Parameters) -> None:
         """Raise ParameterError for values that the running loop cannot take up."""
         build_controller(p, first_guess(p))
-        loop = self.loop
-        if loop is not None and p[NOISE] != self.p[NOISE] \
-                and NOISE not in loop.core.estimator.RETUNED:
+        if self.loop is not None and p[NOISE] != self.p[NOISE] \
+                and NOISE not in self.loop.core.estimator.RETUNED:
             raise ParameterError(
                 NOISE, p[NOISE], f'is not taken up live by {p.estimator.law}',
                 'clean the node up, set it, and configure again',
@@ -119,19 +114,21 @@ class Joint:
 
         The result says why it failed, empty if it did not.
         """
-        if self.loop is None or not self.p.estimates.file or not worth_saving(self.loop.estimate):
+        p, estimate = self.p, self.loop.estimate if self.loop else None
+        if estimate is None or not p.estimates.file or not worth_saving(estimate):
             return None
         self.saved_at = time.monotonic()
-        return self._writer.submit(self._write, self.loop.estimate, self.p)
 
-    def _write(self, estimate: Estimate, p: Parameters) -> str:
-        try:
-            save_estimate(Path(p.estimates.file), estimate, p)
-        except OSError as error:
-            text = f'estimates.file={p.estimates.file!r} cannot be written: {error.strerror}'
-            self._node.log.error(text)
-            return text
-        return ''
+        def write() -> str:
+            try:
+                save_estimate(Path(p.estimates.file), estimate, p)
+            except OSError as error:
+                text = f'estimates.file={p.estimates.file!r} cannot be written: {error.strerror}'
+                self._node.log.error(text)
+                return text
+            return ''
+
+        return self._writer.submit(write)
 
     def diagnose(
         self, around: Neighbours, timing: Timing, claim: Mapping[str, object], active: bool,
@@ -153,8 +150,9 @@ class Joint:
         worst = max(findings, key=lambda finding: finding.level > Level.OK)
         worst = worst._replace(level=max(finding.level for finding in findings))
         # What is true of all joints the first one says in the log.
-        speaks = self.name == self._io.joint_names[0] or worst.kind not in OF_MESSAGES
-        publish(worst, {**details_of(findings, around), **values}, logs=speaks)
+        first = self._node.settings.joint_names[0]
+        logs = self.name == first or worst.kind not in OF_MESSAGES
+        publish(worst, {**details_of(findings, around), **values}, logs)
 
     def close(self) -> None:
         """Wait until everything is written, and say in the log what was counted."""

@@ -5,12 +5,11 @@ from __future__ import annotations
 import time
 from array import array
 from collections.abc import Mapping, Sequence
-from itertools import cycle
+from itertools import chain, cycle
 from math import inf, nan
 
 from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Float64, Float64MultiArray, MultiArrayDimension
 
@@ -21,7 +20,7 @@ from backlash_ros.core.loop.learned_model import learned_model_of
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.transfer_function import StateModel
 from backlash_ros.core.simulation.run_record import stated_deviations
-from backlash_ros.nodes.runtime.messages import LabelledArrayPublisher, without_events
+from backlash_ros.nodes.runtime.messages import NO_EVENTS, LabelledArrayPublisher
 
 Row = tuple[float, ...]
 
@@ -30,19 +29,18 @@ class WatchPublisher:
     """Publishes `controller/watch/<label>` for each label of which there is a subscriber.
 
     Of a joint that has a name: `controller/watch/<joint>/<label>`. After v(k) comes the u that it
-    led to, which is known with y(k+1): points of their loop.
+    led to, which is known with y(k+1): points of their loop. heard: labels with a subscriber.
     """
 
     PERIOD_S = 0.04  # between two messages of a topic; a loop at 1 kHz has no time for many more
 
-    def __init__(self, node: Node, joint: str = '') -> None:
-        self._publishers: dict[str, Publisher] = {
+    def __init__(self, node: Node, joint: str) -> None:
+        self._publishers = {
             label: node.create_publisher(
-                Float64, topics.of_node(topics.watched(label, joint)), 10,
-                event_callbacks=without_events(),
+                Float64, topics.of_node(topics.watched(label, joint)), 10, event_callbacks=NO_EVENTS
             ) for label in topics.WATCH_LABELS
         }
-        self.heard: list[str] = []  # labels with a subscriber
+        self.heard: list[str] = []
         self._due_s = -inf
         self._u_waits = False  # for the sample after that of the newest v
 
@@ -72,13 +70,13 @@ class WatchPublisher:
 
 def watched_values(signals: Row, estimates: Row) -> dict[str, float]:
     """The value of each of WATCH_LABELS, nan for bands where the law has no deviations."""
-    signal = dict(zip(topics.SIGNAL_LABELS, signals, strict=True))
     estimate = dict(zip(topics.ESTIMATE_LABELS, estimates, strict=True))
-    values = {'gap': estimate['c_r'] - estimate['c_l']}
+    values = dict(zip(topics.SIGNAL_LABELS, signals, strict=True))
+    del values['sample']
     for name in topics.BACKLASH:
         value, half = estimate[name], 2.0 * estimate[f'std_{name}']
         values |= {name: value, f'{name}_low': value - half, f'{name}_high': value + half}
-    return values | {name: value for name, value in signal.items() if name != 'sample'}
+    return values | {'gap': estimate['c_r'] - estimate['c_l']}
 
 
 class StepPublisher:
@@ -93,33 +91,32 @@ class StepPublisher:
     heard = True
 
     def __init__(self, node: Node, joints: Sequence[str]) -> None:
-        self._signals, self._estimates = (
+        self._rows = [
             LabelledArrayPublisher(node, topics.of_node(topic), [
-                topics.of_joint(label, joint) for joint in joints for label in labels
-            ]) for topic, labels in (
-                (topics.SIGNALS, topics.SIGNAL_LABELS), (topics.ESTIMATES, topics.ESTIMATE_LABELS)
-            )
-        )
+                topics.of_joint(label, joint) for joint in joints
+                for label in topics.LABELS_OF[topic]
+            ]) for topic in (topics.SIGNALS, topics.ESTIMATES)
+        ]
         self._watches = {joint: WatchPublisher(node, joint) for joint in joints}
         self._turns = cycle(self._watches.values())
 
     @property
     def listeners(self) -> int:
         """How many subscribers there are to every step."""
-        return min(self._signals.listeners, self._estimates.listeners)
+        return min(publisher.listeners for publisher in self._rows)
 
     def look(self) -> None:
         """Look who listens; to ask at every sample would take a tenth of it."""
         next(self._turns).look()
-        self.heard = bool(self._signals.listeners or self._estimates.listeners) \
+        self.heard = any(publisher.listeners for publisher in self._rows) \
             or any(watch.heard for watch in self._watches.values())
 
     def publish(self, loops: Mapping[str, ControlLoop], steps: Mapping[str, ControlStep]) -> None:
         """Tell of the steps of a sample."""
         if self.heard:
             rows = {joint: _rows(loop, steps.get(joint)) for joint, loop in loops.items()}
-            self._signals.publish(sum((signals for signals, _ in rows.values()), ()))
-            self._estimates.publish(sum((estimates for _, estimates in rows.values()), ()))
+            for publisher, row in zip(self._rows, zip(*rows.values(), strict=True), strict=True):
+                publisher.publish([*chain(*row)])
             for joint in steps:
                 self._watches[joint].follow(*rows[joint])
 
@@ -146,8 +143,7 @@ class ModelPublisher:
         # subscriber that is held up misses none, and one of each joint.
         newest = QoSProfile(depth=20, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._publisher = node.create_publisher(
-            Float64MultiArray, topics.of_node(topics.MODEL), newest,
-            event_callbacks=without_events(),
+            Float64MultiArray, topics.of_node(topics.MODEL), newest, event_callbacks=NO_EVENTS
         )
         self._joint = joint
         # The newest one that followed a sample, and the number of that.
@@ -162,18 +158,14 @@ class ModelPublisher:
             self._told = learned, index
             self.publish(loop, p)
 
-    def publish_last(self, loop: ControlLoop, p: Parameters) -> None:
-        """Publish before the end, and wait until who listens has it: a recorder ends next."""
-        self.publish(loop, p)
-        self._publisher.wait_for_all_acked(Duration(seconds=1))
-
-    def publish(self, loop: ControlLoop, p: Parameters) -> None:
-        """Publish at once."""
+    def publish(self, loop: ControlLoop, p: Parameters, wait_s: int = 0) -> None:
+        """Publish at once. wait_s: how long at most until who listens has it."""
         fields = learned_model_of(loop.core.estimator, p).fields()
-        message = Float64MultiArray()
+        message = Float64MultiArray(data=array('d', chain(*fields.values())))
         message.layout.dim = [
             MultiArrayDimension(label=topics.of_joint(label, self._joint), size=len(values))
             for label, values in fields.items()
         ]
-        message.data = array('d', [value for values in fields.values() for value in values])
         self._publisher.publish(message)
+        if wait_s:
+            self._publisher.wait_for_all_acked(Duration(seconds=wait_s))

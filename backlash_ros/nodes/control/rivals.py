@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import socket
-import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
@@ -28,24 +27,22 @@ ENDPOINT, SINCE = 'endpoint of control', 'active since [ns]'
 
 
 class Presence:
-    """Makes a publisher of a topic known to all of this machine until it is closed.
+    """Makes a publisher of a topic known to all of this machine as long as the socket is open.
 
     Discovery may take seconds. Every controller therefore holds a Unix socket in the abstract
     namespace of Linux, named after domain, topic and the identity of its publisher. The kernel
     lists these names, and takes a name back with its process, however that ends. Processes in
-    containers see each other if they share the network; other systems than Linux list nobody.
+    containers see each other if they share the network.
     """
 
     def __init__(self, domain: int, topic: str, identity: str) -> None:
         # A name may have 107 bytes, a topic more.
         place = hashlib.sha256(f'{domain} {topic}'.encode()).hexdigest()[:32]
         self._prefix, self._own = f'@backlash_ros/{place}/', identity
-        self._socket: socket.socket | None = None
-        if sys.platform == 'linux':
-            self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-            # Nobody else can have this identity; where sockets are forbidden, nobody is listed.
-            with suppress(OSError):
-                self._socket.bind(f'\0{self._prefix[1:]}{identity}')
+        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        # Nobody else can have this identity; where sockets are forbidden, nobody is listed.
+        with suppress(OSError):
+            self.socket.bind(f'\0{self._prefix[1:]}{identity}')
 
     def others(self) -> frozenset[str]:
         """Identities of the other publishers."""
@@ -53,15 +50,8 @@ class Presence:
             listed = Path('/proc/net/unix').read_text().splitlines()
         except OSError:
             return frozenset()
-        names = (line.rsplit(' ', 1)[-1] for line in listed)
-        return frozenset(
-            name.removeprefix(self._prefix) for name in names if name.startswith(self._prefix)
-        ) - {self._own}
-
-    def close(self) -> None:
-        """Let go of the name."""
-        if self._socket is not None:
-            self._socket.close()
+        parts = (line.rpartition(self._prefix) for line in listed)
+        return frozenset(identity for _, found, identity in parts if found) - {self._own}
 
 
 class Rival(NamedTuple):
@@ -78,15 +68,13 @@ class Rivals:
     identity of the publisher. Whoever says nothing of the kind was first if it was there when this
     controller became active. A controller that is not active, or has fallen silent, is no rival.
 
-    own: identity of the own publisher. since_ns: since when this controller is active, 0 if it is
-    not. settled_at: when it has found who was there already, on the steady clock as all other
-    times [s].
+    since_ns: since when this controller is active, 0 if it is not. settled_at: when it has found
+    who was there already, on the steady clock as all other times [s].
     """
 
     def __init__(self, own: str, settled_at: float) -> None:
         self.own, self.settled_at = own, settled_at
-        self.since_ns = 0
-        self._active_at = inf
+        self.since_ns, self._active_at = 0, inf
         self._first_seen: dict[str, float] = {}
         # What controllers say: active since [ns], 0 if they are not, and when they have said so.
         self._claims: dict[str, tuple[int, float]] = {}
@@ -141,7 +129,7 @@ class RivalWatch:
         self._hello_until = -inf  # until then others are told at every look who was first
         self._diagnostics: Subscription | None = None  # listened to only beside others
         self.commands: Subscription | None = None  # of who is in charge, if it is another one
-        node.create_timer(0.2, self.look, clock=node.steady_clock)
+        node.every(0.2, self.look)
 
     @property
     def settled(self) -> bool:

@@ -1,4 +1,4 @@
-"""What can be asked of a running controller."""
+"""What can be asked of a running controller: transitions of its life cycle, and its services."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future as Writing
 from typing import Any, cast
 
+from lifecycle_msgs.srv import ChangeState
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 from rclpy.task import Future
@@ -13,6 +14,22 @@ from std_srvs.srv import SetBool, Trigger
 
 from backlash_ros.core.estimates_file import worth_saving
 from backlash_ros.core.loop.control_loop import ControlLoop
+
+
+def refuse_unfit_transitions(node: Node) -> None:
+    """Answer a transition that the present state does not have, instead of ending of it."""
+    service = next(s for s in node.services if s.srv_type is ChangeState)
+    change = cast(Callable[..., Any], service.callback)
+
+    def checked(request: ChangeState.Request, response: ChangeState.Response) -> Any:
+        try:
+            return change(request, response)
+        except RuntimeError as error:  # RCLError has no public name
+            node.get_logger().warning(f'no such transition now: {" ".join(str(error).split())}')
+            response.success = False
+            return response
+
+    service.callback = checked
 
 
 def offer_services(
@@ -51,10 +68,13 @@ def offer_services(
         elif not any(worth_saving(loop.estimate) for loop in loops_of()):
             response.message = 'nothing was learned yet'
         else:
-            # The loop goes on while the disk takes its time.
             reasons = []
-            for saved in save_estimates():
-                reasons.append(await _result_of(saved))
+            for writing in save_estimates():
+                # The loop goes on while the disk takes its time.
+                written: Future = Future()
+                writing.add_done_callback(written.set_result)
+                await written
+                reasons.append(writing.result())
             why = '; '.join(filter(None, reasons))
             response.success = not why
             response.message = why or f'saved in {files()}'
@@ -71,11 +91,3 @@ def offer_services(
         Trigger, '~/save_estimates', cast(Callable[..., Trigger.Response], save),
         callback_group=MutuallyExclusiveCallbackGroup(),
     )
-
-
-async def _result_of(writing: Writing[str]) -> str:
-    """What a thread comes to, while the executor goes on."""
-    written: Future = Future()
-    writing.add_done_callback(lambda _: written.set_result(None))
-    await written
-    return writing.result()

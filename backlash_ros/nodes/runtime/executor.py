@@ -20,13 +20,10 @@ WITH_INFO = Subscription.CallbackType.WithMessageInfo
 
 
 class Polled(MutuallyExclusiveCallbackGroup):
-    """Of subscriptions that no executor serves: their messages wait until somebody looks.
+    """Of subscriptions that PromptExecutor does not serve: their messages wait for serve_polled.
 
     To take a message costs a tenth of what it costs to be woken up by it.
     """
-
-    def can_execute(self, entity: Any) -> bool:
-        return False
 
 
 def serve_polled(subscription: Subscription) -> None:
@@ -64,7 +61,6 @@ class PromptExecutor(SingleThreadedExecutor):
         return not isinstance(entity, (Subscription, Timer)) and bool(super().can_execute(entity))
 
     def shutdown(self, timeout_sec: float | None = None) -> bool:
-        """Stop serving."""
         self._wait_set = None
         return bool(super().shutdown(timeout_sec))
 
@@ -80,11 +76,17 @@ class PromptExecutor(SingleThreadedExecutor):
         self.look_if_due(ahead_ns=5_000_000 if self.serve_urgent(max(wait_ns, 0)) else 0)
 
     def serve_urgent(self, wait_ns: int) -> bool:
-        """Serve one message of each topic, and wait for the first one so long at most.
-
-        Returns whether there was any.
-        """
-        self._prepare()
+        """Serve one message of each topic, after at most this wait; returns whether any came."""
+        subscriptions = list(self._node.subscriptions)
+        if subscriptions != self._subscriptions or self._wait_set is None:
+            self._subscriptions = subscriptions
+            self._served = [(
+                each.handle, each.handle.pointer, each.handle.take_message, each.msg_type,
+                each.raw, each.callback, each._callback_type == WITH_INFO,
+            ) for each in subscriptions if not isinstance(each.callback_group, Polled)]
+            self._wait_set = rclpy_implementation.WaitSet(
+                len(self._served), 0, 0, 0, 0, 0, self._node.context.handle
+            )
         if not self._served:
             time.sleep(wait_ns * 1e-9)
             return False
@@ -121,20 +123,6 @@ class PromptExecutor(SingleThreadedExecutor):
         due = [timer.time_until_next_call() for timer in self._node.timers]
         wait_ns = min((ns for ns in due if ns is not None), default=look_ns)
         self._look_at_ns = min(now + max(wait_ns, 0), self._rclpy_at_ns)
-
-    def _prepare(self) -> None:
-        """Make a wait set for what the node has now."""
-        subscriptions = list(self._node.subscriptions)
-        if subscriptions == self._subscriptions and self._wait_set is not None:
-            return
-        self._subscriptions = subscriptions
-        self._served = [(
-            each.handle, each.handle.pointer, each.handle.take_message, each.msg_type, each.raw,
-            each.callback, each._callback_type == WITH_INFO,
-        ) for each in subscriptions if not isinstance(each.callback_group, Polled)]
-        self._wait_set = rclpy_implementation.WaitSet(
-            len(self._served), 0, 0, 0, 0, 0, self._node.context.handle
-        )
 
     def _serve_rest(self) -> bool:
         """Let rclpy serve one thing that is ready; return whether there was any."""

@@ -1,17 +1,26 @@
-"""Messages that are made once and published often."""
+"""Messages that are made once and published often, and those of every sample as bytes.
+
+rclpy takes and publishes these bytes as they are, in half the time of a std_msgs/Float64, and in a
+tenth of that of a sensor_msgs/JointState of six joints. Four bytes name the encoding, the second
+one odd where the lowest byte comes first. What follows is aligned to its size (CDR: DDS
+Interoperability Wire Protocol, 10.2).
+"""
 
 from __future__ import annotations
 
 import time
 from array import array
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from struct import Struct, pack, unpack_from
+from typing import NamedTuple
 
-from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from rosgraph_msgs.msg import Clock
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 
 from backlash_ros import topics
@@ -23,12 +32,10 @@ DIAGNOSTICS_PERIOD_S = 1.0  # of every node, besides each change
 SILENT_S = 3.0 * DIAGNOSTICS_PERIOD_S  # after which a node that has said something is gone
 # In lockstep a missed message would stop the loop for good: who comes late gets it all the same.
 KEPT_QOS = QoSProfile(depth=DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-
-
-def without_events() -> PublisherEventCallbacks:
-    """For publishers that the loop does not depend on: nobody is told of unfit subscribers."""
-    # At every look at what is not urgent the executor goes through every event of every publisher.
-    return PublisherEventCallbacks(use_default_callbacks=False)
+# For publishers that the loop does not depend on, nobody is told of unfit subscribers: at every
+# look at what is not urgent the executor goes through every event of every publisher.
+NO_EVENTS = PublisherEventCallbacks(use_default_callbacks=False)
+CDR_FLOAT64 = Struct('<xBxxd')
 
 
 class LabelledArrayPublisher:
@@ -36,7 +43,7 @@ class LabelledArrayPublisher:
 
     def __init__(self, node: Node, topic: str, labels: Sequence[str]) -> None:
         self._publisher = node.create_publisher(
-            Float64MultiArray, topic, DEPTH, event_callbacks=without_events()
+            Float64MultiArray, topic, DEPTH, event_callbacks=NO_EVENTS
         )
         self._message = Float64MultiArray()
         self._message.layout.dim = [MultiArrayDimension(label=label, size=1) for label in labels]
@@ -60,51 +67,110 @@ class DiagnosticsPublisher:
     """
 
     def __init__(self, node: Node, hardware_id: str, part: str = '') -> None:
-        self._node, self._part = node, part
+        self._node, self._prefix = node, f'{part}: ' if part else ''
         self._publisher = node.create_publisher(
-            DiagnosticArray, topics.DIAGNOSTICS, 10, event_callbacks=without_events()
+            DiagnosticArray, topics.DIAGNOSTICS, 10, event_callbacks=NO_EVENTS
         )
         name = node.get_fully_qualified_name().strip('/') + (f': {part}' if part else '')
         self._status = DiagnosticStatus(name=name, hardware_id=hardware_id)
-        self._message = DiagnosticArray(status=[self._status])
         self._log = LevelLog(self._write)
 
     def publish(self, finding: Finding, values: Mapping[str, object], logs: bool = True) -> None:
-        """finding: what is going on, and what to do if it is wrong. values: details to it.
-
-        logs: False for what another part of the node has to say in the log.
-        """
+        """values: details to it. logs: False for what another part of the node says in the log."""
         self._status.level, self._status.message = bytes([finding.level]), finding.text
         self._status.values = [
             KeyValue(key=key, value=f'{value:.6g}' if isinstance(value, float) else str(value))
             for key, value in values.items()
         ]
-        self._message.header.stamp = self._node.get_clock().now().to_msg()
-        self._publisher.publish(self._message)
+        message = DiagnosticArray(status=[self._status])
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(message)
         if logs:
             self._log.take(finding, time.monotonic())
 
     def _write(self, level: Level, text: str) -> None:
         log = Node.get_logger(self._node)
-        text = f'{self._part}: {text}' if self._part else text
         # rclpy remembers a severity for each place in the code.
         if level == Level.OK:
-            log.info(text)
+            log.info(self._prefix + text)
         elif level == Level.WARN:
-            log.warning(text)
+            log.warning(self._prefix + text)
         else:
-            log.error(text)
-
-
-def clock_message(stamp_ns: int) -> Clock:
-    return Clock(clock=Time(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9))
-
-
-def stamp_ns_of(message: Clock) -> int:
-    return int(message.clock.sec * 10**9 + message.clock.nanosec)
+            log.error(self._prefix + text)
 
 
 def arrival_ns(received_ns: int) -> int:
     """When a message arrived, on the monotonic clock, from what the middleware says of it."""
     # A clock that was set back since must not put it into the future.
     return time.monotonic_ns() - max(time.time_ns() - received_ns, 0)
+
+
+def number_of(message: bytes) -> float:
+    """What a std_msgs/Float64 holds."""
+    number: float = (CDR_FLOAT64 if message[1] & 1 else Struct('>xBxxd')).unpack_from(message)[1]
+    return number
+
+
+def message_with(number: float) -> bytes:
+    """A std_msgs/Float64."""
+    return CDR_FLOAT64.pack(1, number)
+
+
+class JointMessage(NamedTuple):
+    """What a sensor_msgs/JointState holds but for its frame; stamp_ns: of its header."""
+
+    stamp_ns: int = 0
+    name: tuple[str, ...] = ()
+    position: Sequence[float] = ()
+    velocity: Sequence[float] = ()
+    effort: Sequence[float] = ()
+
+
+class JointReader:
+    """Reads messages that mostly are about the same joints."""
+
+    def __init__(self) -> None:
+        self._head = b''  # of the newest message, from its frame to its names
+        self._name: tuple[str, ...] = ()
+
+    def read(self, message: bytes) -> JointMessage:
+        """What a sensor_msgs/JointState holds."""
+        order = '<' if message[1] & 1 else '>'
+        seconds, nanoseconds = unpack_from(order + 'iI', message, 4)
+        at = 12 + len(self._head)
+        if not self._head or message[12:at] != self._head:
+            state = deserialize_message(message, JointState)
+            self._name = tuple(state.name)
+            at = 12 + len(_head_of(state.header.frame_id, self._name))
+            self._head = message[12:at]
+        fields = []
+        for _ in range(3):
+            at += -at % 4
+            count, = unpack_from(order + 'I', message, at)
+            at += 4
+            if count:
+                at += (4 - at) % 8  # the encoding before does not count
+            fields.append(unpack_from(f'{order}{count}d', message, at))
+            at += 8 * count
+        return JointMessage(seconds * 10**9 + nanoseconds, self._name, *fields)
+
+
+def joint_message(content: JointMessage) -> bytes:
+    """A sensor_msgs/JointState without a frame."""
+    message = bytearray(pack('<xBxxiI', 1, *divmod(content.stamp_ns, 10**9)))
+    message += _head_of('', content.name)
+    for values in content[2:]:
+        message += bytes(-len(message) % 4) + len(values).to_bytes(4, 'little')
+        if values:
+            message += bytes((4 - len(message)) % 8) + pack(f'<{len(values)}d', *values)
+    return bytes(message)
+
+
+@lru_cache(maxsize=8)
+def _head_of(frame: str, names: tuple[str, ...]) -> bytes:
+    texts = [text.encode() + b'\x00' for text in (frame, *names)]
+    parts = [len(text).to_bytes(4, 'little') + text for text in texts]
+    head = parts[0]
+    for part in len(names).to_bytes(4, 'little'), *parts[1:]:
+        head += bytes(-len(head) % 4) + part
+    return head

@@ -9,7 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from rcl_interfaces import msg
+from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
@@ -31,9 +31,48 @@ class ParameterNode(Node):
 
     settings: Parameters
 
-    def set_parameters_atomically(
-        self, parameter_list: list[RosParameter],
-    ) -> msg.SetParametersResult:
+    def declare_settings(self, executable: str, reconfigurable: bool) -> None:
+        """Declare and check what the table says this executable uses.
+
+        reconfigurable: whether all but the fixed ones may change while the node is unconfigured.
+        Raises ParameterError for what rclpy would ignore (a given name that nobody declares) or
+        refuse.
+        """
+        # rclpy has no other way to ask for all names that were given; two are declared by itself.
+        given = {
+            name: _given_value(parameter)
+            for name, parameter in self.handle.get_parameters(RosParameter).items()
+            if name not in ('use_sim_time', 'start_type_description_service')
+        }
+        self.settings = parameters = Parameters(given)
+        values = {p.name: parameters[p.name] for p in BY_NAME.values() if executable in p.used_by}
+        if executable == CONTROLLER:
+            # Of a joint's own parameters those that were given: all of them would be hundreds.
+            values |= {
+                name: parameters.of_joint(joint)[own] for name in given
+                for joint, _, own in [name.partition('.')] if joint in parameters.joint_names
+            }
+        for name, value in values.items():
+            entry = entry_of(name)
+            assert entry is not None
+            present = _ros_parameter(name, value, entry)
+            # The type of an empty list is declared by another one, and with a value missing rclpy
+            # would tell none of those that it is asked for.
+            of_the_type = [''] if entry.names else [0.0]
+            self.declare_parameter(
+                name, of_the_type if value == () else present.value, ignore_override=True
+            )
+            if value == ():
+                self.set_parameters([present])
+            self.set_descriptor(name, ParameterDescriptor(
+                name=name, type=_ros_parameter(name, entry.default, entry).type_.value,
+                description=entry.description + (f' [{entry.unit}]' if entry.unit else ''),
+                additional_constraints='one of ' + ', '.join(entry.choices) if entry.choices
+                else entry.rules,
+                read_only=entry.change not in ('live', *['unconfigured'] * reconfigurable),
+            ))
+
+    def set_parameters_atomically(self, parameter_list: list[RosParameter]) -> SetParametersResult:
         """Set what differs from the present values, in the declared types.
 
         Command-line tools send 1e-6 as a text and [1, 2] as integers, and load whole files in which
@@ -43,102 +82,53 @@ class ParameterNode(Node):
         try:
             for change in parameter_list:
                 name, entry = change.name, entry_of(change.name)
-                present = self.get_parameter(name).value if self.has_parameter(name) else None
+                present = self.get_parameter_or(name).value
                 if entry is None or present is None:
                     changes += [change] * (present is None or change.value != present)
                 elif (value := check_value(entry, _given_value(change))) \
                         != check_value(entry, present):
                     changes.append(_ros_parameter(name, value, entry))
         except ParameterError as error:
-            return msg.SetParametersResult(successful=False, reason=str(error))
+            return SetParametersResult(successful=False, reason=str(error))
         if not changes:
-            return msg.SetParametersResult(successful=True)
+            return SetParametersResult(successful=True)
         return super().set_parameters_atomically(changes)
 
+    def let_parameters_change(
+        self, check: Callable[[Parameters], object], apply: Callable[[Parameters], None],
+        is_free: Callable[[], bool] = lambda: False,
+    ) -> None:
+        """Let parameters change in a running node, all or nothing.
 
-def declare_parameters(node: Node, executable: str, reconfigurable: bool = False) -> Parameters:
-    """Declare what the table says this executable uses; return the complete, checked set.
+        check: raises ParameterError for a set that the node cannot take up. apply: takes up the new
+        settings, given the ones before. is_free: whether the node is unconfigured, so that those
+        may change as well that are not live.
+        """
+        def changed(changes: list[RosParameter]) -> Parameters:
+            return self.settings.replaced(
+                {change.name: change.value for change in changes if entry_of(change.name)}
+            )
 
-    reconfigurable: whether all but the fixed ones may change while the node is unconfigured.
-    Raises ParameterError for what rclpy would ignore (a given name that nobody declares) or refuse.
-    """
-    # rclpy has no other way to ask for all names that were given; two are declared by itself.
-    given = {
-        name: _given_value(parameter)
-        for name, parameter in node.handle.get_parameters(RosParameter).items()
-        if name not in ('use_sim_time', 'start_type_description_service')
-    }
-    parameters = Parameters(given)
-    values = {p.name: parameters[p.name] for p in BY_NAME.values() if executable in p.used_by}
-    if executable == CONTROLLER:
-        # Of a joint's own parameters those that were given: all of them would be hundreds.
-        values |= {
-            name: parameters.of_joint(joint)[own] for name in given
-            for joint, _, own in [name.partition('.')] if joint in parameters.joint_names
-        }
-    for name, value in values.items():
-        entry = entry_of(name)
-        assert entry is not None
-        present = _ros_parameter(name, value, entry)
-        # The type of an empty list is declared by another one, and with a value missing rclpy would
-        # tell none of those that it is asked for.
-        of_the_type = [''] if entry.names else [0.0]
-        node.declare_parameter(
-            name, of_the_type if value == () else present.value, msg.ParameterDescriptor(),
-            ignore_override=True,
-        )
-        if value == ():
-            node.set_parameters([present])
-        node.set_descriptor(name, _description(entry, name, reconfigurable))
-    return parameters
+        def on_set(changes: list[RosParameter]) -> SetParametersResult:
+            for change in changes:
+                entry = entry_of(change.name)
+                if entry is not None and not (entry.change == 'live' or is_free()):
+                    return SetParametersResult(successful=False, reason=(
+                        f'{change.name} is read-only while the node is configured: deactivate it '
+                        'and clean it up first'
+                    ))
+            try:
+                check(changed(changes))
+            except ParameterError as error:
+                return SetParametersResult(successful=False, reason=str(error))
+            return SetParametersResult(successful=True)
 
+        def post_set(changes: list[RosParameter]) -> None:
+            before, self.settings = self.settings, changed(changes)
+            apply(before)
 
-def let_parameters_change(
-    node: ParameterNode, check: Callable[[Parameters], object],
-    apply: Callable[[Parameters], None], is_free: Callable[[], bool] = lambda: False,
-) -> None:
-    """Let parameters change in a running node, all or nothing.
-
-    check: raises ParameterError for a set that the node cannot take up. apply: takes up the new
-    settings of the node, given the ones before. is_free: whether those may change as well that are
-    not live: the node is unconfigured.
-    """
-    def changed(changes: list[RosParameter]) -> Parameters:
-        return node.settings.replaced(
-            {change.name: change.value for change in changes if entry_of(change.name) is not None}
-        )
-
-    def on_set(changes: list[RosParameter]) -> msg.SetParametersResult:
-        for change in changes:
-            entry = entry_of(change.name)
-            if entry is not None and not (entry.change == 'live' or is_free()):
-                return msg.SetParametersResult(successful=False, reason=(
-                    f'{change.name} is read-only while the node is configured: deactivate it and '
-                    'clean it up first'
-                ))
-        try:
-            check(changed(changes))
-        except ParameterError as error:
-            return msg.SetParametersResult(successful=False, reason=str(error))
-        return msg.SetParametersResult(successful=True)
-
-    def post_set(changes: list[RosParameter]) -> None:
-        before, node.settings = node.settings, changed(changes)
-        apply(before)
-
-    node.add_on_set_parameters_callback(on_set)
-    node.add_post_set_parameters_callback(post_set)
-
-
-def _description(entry: Parameter, name: str, reconfigurable: bool) -> msg.ParameterDescriptor:
-    """What tools like rqt and `ros2 param describe` show."""
-    return msg.ParameterDescriptor(
-        name=name, type=_ros_parameter(name, entry.default, entry).type_.value,
-        description=entry.description + (f' [{entry.unit}]' if entry.unit else ''),
-        additional_constraints='one of ' + ', '.join(entry.choices) if entry.choices
-        else entry.rules,
-        read_only=entry.change not in ('live', *['unconfigured'] * reconfigurable),
-    )
+        self.add_on_set_parameters_callback(on_set)
+        self.add_post_set_parameters_callback(post_set)
 
 
 def _given_value(parameter: RosParameter) -> object:
@@ -158,25 +148,20 @@ def _ros_parameter(name: str, value: Value, entry: Parameter) -> RosParameter:
     return RosParameter(name, value=list(value) if isinstance(value, tuple) else value)
 
 
-def complaints(arguments: Sequence[str], executable: str, full_name: str) -> list[str]:
+def complaints(arguments: Sequence[str], executable: str, full_name: str) -> Iterator[str]:
     """A sentence for each section of the given files that was probably meant for this node.
 
-    ROS 2 passes over a section whose name is not that of the node, without a word. arguments: of
-    the command line. full_name: of the node, with its namespace.
+    ROS 2 passes over a section whose name is not that of the node, without a word.
     """
-    found = []
     for option, file in pairwise(arguments):
         if option == '--params-file':
             import yaml  # most nodes start without a file
 
             # ROS 2 itself has refused what cannot be read.
             content = yaml.safe_load(Path(file).read_text(encoding='utf-8'))
-            found += [
-                f'{file}: section {name} is not for {full_name}, its values are not used: '
-                f'write /**/{full_name.rpartition("/")[2]}'
-                for name in unused(list(_section_names(content)), executable, full_name)
-            ]
-    return found
+            for name in unused(list(_section_names(content)), executable, full_name):
+                yield f'{file}: section {name} is not for {full_name}, its values are not used: ' \
+                    f'write /**/{full_name.rpartition("/")[2]}'
 
 
 def unused(sections: Sequence[str], executable: str, full_name: str) -> list[str]:

@@ -14,7 +14,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from math import isfinite
-from typing import Any, cast
+from typing import Any
 
 import rclpy
 from rclpy.clock import Clock
@@ -26,12 +26,13 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
+from rclpy.timer import Timer
 from rclpy.utilities import remove_ros_args
 
 from backlash_ros.core.parameters import BY_NAME, ParameterError, as_yaml
-from backlash_ros.middleware.loopback import prefer_loopback
+from backlash_ros.middleware import prefer_loopback
 from backlash_ros.nodes.runtime.executor import Polled, PromptExecutor
-from backlash_ros.nodes.runtime.parameters import ParameterNode, complaints, declare_parameters
+from backlash_ros.nodes.runtime.parameters import ParameterNode, complaints
 from backlash_ros.options import BAD_INPUT, DONE, FAILED, OptionParser
 
 ENABLED = os.environ.get('BACKLASH_ROS_EVENTS') == '1'
@@ -43,11 +44,10 @@ def emit(event: str, **content: object) -> None:
     Nothing unless BACKLASH_ROS_EVENTS=1. JSON has no nan: null.
     """
     if ENABLED:
-        checked = {
+        print(json.dumps({'event': event} | {
             name: None if isinstance(value, float) and not isfinite(value) else value
             for name, value in content.items()
-        }
-        print(json.dumps({'event': event, **checked}), flush=True)
+        }), flush=True)
 
 
 def ros_arguments(arguments: Sequence[str]) -> list[str]:
@@ -74,15 +74,11 @@ class ProcessNode(ParameterNode):
     def __init__(
         self, executable: str, parameters_of: str = '', reconfigurable: bool = False,
     ) -> None:
-        """parameters_of: the executable whose parameters it reads. Raises ParameterError.
-
-        reconfigurable: whether parameters may change while the node is unconfigured.
-        """
+        """parameters_of: the executable whose parameters it reads. Raises ParameterError."""
         super().__init__(executable)
         self.begun_at = time.monotonic()
         self.log = Node.get_logger(self)
-        self.settings = declare_parameters(self, parameters_of or executable, reconfigurable)
-        self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self.declare_settings(parameters_of or executable, reconfigurable)
         self.signals: list[int] = []
         self.exit_code = DONE
 
@@ -91,10 +87,9 @@ class ProcessNode(ParameterNode):
         """Whether a signal asks the node to end; the executor looks up ten times a second."""
         return bool(self.signals)
 
-    @property
-    def urged(self) -> bool:
-        """Whether a SIGTERM has come after the first signal: SIGKILL would be the next."""
-        return signal.SIGTERM in self.signals[1:]
+    def every(self, period_s: float, action: Callable[[], Any]) -> Timer:
+        """Call action so often, on the steady clock."""
+        return self.create_timer(period_s, action, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def listen(
         self, message_type: type[Any], topic: str,
@@ -106,10 +101,10 @@ class ProcessNode(ParameterNode):
         polled: it is called by serve_polled alone.
         """
         # rclpy takes such callbacks but does not say so in its types.
-        plain = cast(Callable[[Any], None], callback)
-        untyped: Any = Polled
+        untyped: Any = callback
+        group: Any = Polled
         return self.create_subscription(
-            message_type, topic, plain, qos, raw=raw, callback_group=untyped() if polled else None
+            message_type, topic, untyped, qos, raw=raw, callback_group=group() if polled else None
         )
 
     def work(self, executor: PromptExecutor) -> None:
@@ -136,7 +131,7 @@ class ProcessNode(ParameterNode):
                 remind += remind_period_s
                 self.log.info(f'waiting for {awaited}')
 
-        timer = self.create_timer(0.01, look, clock=self.steady_clock)
+        timer = self.every(0.01, look)
 
 
 def run(
@@ -155,8 +150,8 @@ def run(
         signal.signal(number, lambda number, frame: signals.append(number))
     try:
         try:
-            _initialise(args)
-            _parse_plain_arguments(executable, make_node, arguments)
+            _initialise(arguments)
+            _refuse_plain_arguments(executable, make_node, arguments)
             node = make_node()
         except (ParameterError, NameValidationException, InitialisationError) as error:
             print(f'{executable}: {" ".join(str(error).split())}', file=sys.stderr)
@@ -211,9 +206,7 @@ def exit_at_the_latest(within_s: float, code: int) -> Iterator[None]:
     # struct sigevent: the argument of the function, signal, kind, function, attributes.
     thread = 2  # SIGEV_THREAD of <signal.h>: the timer calls a function, in a thread of its own
     event = struct.pack('@PiiPP32x', code, 0, thread, exit_now, 0)
-    # Out of timers, or on another system than Linux: without a last resort.
-    armed = sys.platform == 'linux' \
-        and c.timer_create(time.CLOCK_MONOTONIC, event, ctypes.byref(timer)) == 0
+    armed = c.timer_create(time.CLOCK_MONOTONIC, event, ctypes.byref(timer)) == 0
     if armed:
         # struct itimerspec: period and delay as seconds and nanoseconds.
         delay = struct.pack('@4l', 0, 0, int(within_s), int(within_s % 1.0 * 1e9))
@@ -225,13 +218,13 @@ def exit_at_the_latest(within_s: float, code: int) -> Iterator[None]:
             c.timer_delete(timer)
 
 
-def _initialise(args: list[str] | None) -> None:
-    """Initialise ROS; raises InitialisationError."""
+def _initialise(arguments: list[str]) -> None:
+    """Raises InitialisationError."""
     prefer_loopback(os.environ)
     # rcl would add a line without content to the one that says what is wrong.
     set_logger_level('rcl', LoggingSeverity.FATAL)
     try:
-        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:
         # Where in the sources of rcl it was found helps nobody.
         reason = str(error).split(', at /')[0]
@@ -243,7 +236,7 @@ def _initialise(args: list[str] | None) -> None:
             set_logger_level('rcl', LoggingSeverity.UNSET)
 
 
-def _parse_plain_arguments(
+def _refuse_plain_arguments(
     executable: str, make_node: Callable[[], ProcessNode], arguments: Sequence[str],
 ) -> None:
     """Refuse what is no argument of ROS; print help where asked for."""

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import backlash_ros
-from backlash_ros.middleware.loopback import prefer_loopback
+from backlash_ros.middleware import prefer_loopback
 from backlash_ros.tools.cli import ONE_THREAD, BrokenOffError
 
 

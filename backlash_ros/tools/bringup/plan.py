@@ -12,7 +12,7 @@ from pathlib import Path
 
 from backlash_ros.core.assembly import build_controller, build_plant, build_reference
 from backlash_ros.core.parameters import ParameterError, Parameters
-from backlash_ros.middleware.installed import ROS_MISSING, ros_is_missing
+from backlash_ros.middleware import ROS_MISSING, ros_is_missing
 from backlash_ros.tools.bringup.environment import child_environment, foreign_environment
 from backlash_ros.tools.bringup.supervisor import Child
 from backlash_ros.tools.cli import BrokenOffError, InputError, number_of_samples, print_warnings

@@ -25,7 +25,7 @@ from backlash_ros import topics
 from backlash_ros.core.identification.result import Identification
 from backlash_ros.core.parameters import Parameters, Value
 from backlash_ros.core.records.record import Record, RecordError
-from backlash_ros.middleware.installed import ROS_MISSING, ros_is_missing
+from backlash_ros.middleware import ROS_MISSING, ros_is_missing
 from backlash_ros.options import BAD_INPUT
 from backlash_ros.tools.cli import BrokenOffError, InputError, StopRequests
 from backlash_ros.tools.config import write_config

@@ -11,18 +11,18 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
-from backlash_ros.middleware.loopback import PROFILE, prefer_loopback
+from backlash_ros.middleware import PROFILE, prefer_loopback
 from backlash_ros.nodes.control.publishing import watched_values
 from backlash_ros.nodes.control.rivals import ENDPOINT, SINCE, Rival, Rivals
-from backlash_ros.nodes.runtime.messages import SILENT_S
-from backlash_ros.nodes.runtime.parameters import unused
-from backlash_ros.nodes.runtime.wire import (
+from backlash_ros.nodes.runtime.messages import (
+    SILENT_S,
     JointMessage,
     JointReader,
     joint_message,
     message_with,
     number_of,
 )
+from backlash_ros.nodes.runtime.parameters import unused
 
 HERE = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
 

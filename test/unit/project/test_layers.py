@@ -13,7 +13,7 @@ PACKAGE = 'backlash_ros'
 SHARED = {
     PACKAGE,
     *(f'{PACKAGE}.{name}' for name in (
-        'atomic_file', 'middleware.installed', 'middleware.loopback', 'options',
+        'atomic_file', 'middleware', 'options',
         'shipped', 'topics',
     )),
 }
