@@ -9,7 +9,6 @@ from argparse import RawDescriptionHelpFormatter
 from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
 from functools import partial
 from math import inf, isfinite, nan
 from typing import Any
@@ -18,42 +17,33 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.subscription import Subscription
 from std_msgs.msg import Float64
 
-from backlash_ros import topics
 from backlash_ros.nodes.runtime.executor import serve_polled
 from backlash_ros.nodes.runtime.messages import SILENT_S
 from backlash_ros.nodes.runtime.process import ProcessNode
 from backlash_ros.options import OptionParser
-from backlash_ros.topics import BACKLASH
+from backlash_ros.topics import BACKLASH, DIAGNOSTICS
 
 
-@dataclass
 class ControllerState:
     """One controller, or a joint of it. node: its name, with namespace. level: of /diagnostics.
 
     values: of /diagnostics, as they stand there. estimates: value and half width of its band of
     two deviations (nan where there are none). scales: the largest magnitudes that were shown.
-    events: time of day and text, the newest one last. subscriptions: polled ones, of what stands
-    below `controller/watch`. watched: what has come of these: label, time of arrival [ns], value.
+    events: time of day and text, the newest one last. watched: what stands below
+    `controller/watch` and came at the last look: label, time of arrival [ns], value.
     """
 
-    node: str
-    joint: str = ''
-    subscriptions: list[Subscription] = field(default_factory=list)
-    watched: list[tuple[str, int, float]] = field(default_factory=list)
-    level: int = 0
-    message: str = ''
-    heard_at_s: float = -inf  # on the steady clock
-    values: dict[str, str] = field(default_factory=dict)
-    estimates: dict[str, tuple[float, float]] = field(
-        default_factory=lambda: dict.fromkeys(BACKLASH, (nan, nan))
-    )
-    scales: dict[str, float] = field(default_factory=lambda: dict.fromkeys(BACKLASH, 0.0))
-    events: deque[tuple[str, str]] = field(default_factory=lambda: deque(maxlen=20))
-
-    @property
-    def name(self) -> str:
-        """As /diagnostics calls it."""
-        return f'{self.node}: {self.joint}' if self.joint else self.node
+    def __init__(self, node: str, joint: str = '') -> None:
+        self.node = node
+        self.name = f'{node}: {joint}' if joint else node  # as /diagnostics calls it
+        self.subscriptions: list[Subscription] = []  # polled ones
+        self.watched: list[tuple[str, int, float]] = []
+        self.level, self.message = 0, ''
+        self.heard_at_s = -inf  # on the steady clock
+        self.values: dict[str, str] = {}
+        self.estimates = dict.fromkeys(BACKLASH, (nan, nan))
+        self.scales = dict.fromkeys(BACKLASH, 0.0)
+        self.events: deque[tuple[str, str]] = deque(maxlen=20)
 
     def hear(self, status: DiagnosticStatus, now_s: float) -> None:
         """Take in what /diagnostics says of it; a text that has changed is an event."""
@@ -66,13 +56,6 @@ class ControllerState:
         self.values = {pair.key: pair.value for pair in status.values}
         for name in BACKLASH:
             self._set_estimate(name, self.number(name), 2.0 * self.number(f'std_{name}'))
-
-    def watch(self) -> list[tuple[str, int, float]]:
-        """Take in what has come since the last call, and return it."""
-        self.watched = []
-        for subscription in self.subscriptions:
-            serve_polled(subscription)
-        return self.watched
 
     def hear_value(self, label: str, message: Float64, info: dict[str, Any]) -> None:
         """Take in one of the values that are watched."""
@@ -122,35 +105,33 @@ class FollowedControllers:
     """Every controller of the domain, or those of some namespaces, by name.
 
     wanted: names of controllers or namespaces, none for all. labels: which of the messages below
-    `controller/watch` to take, and depth: how many of each may wait. Messages are taken when
-    somebody looks: nothing wakes up for each of them.
+    `controller/watch` to take, and depth: how many of each may wait. awaited: what is waited for
+    while there is none.
     """
 
     def __init__(
         self, node: ProcessNode, wanted: Sequence[str], labels: Sequence[str], depth: int,
     ) -> None:
         self._node, self._labels, self._depth = node, labels, depth
-        self._wanted = ['/' + name.strip('/') for name in wanted]
+        self._wanted = tuple(f'/{name.strip("/")}/'.replace('//', '/') for name in wanted) or '/'
+        which = ' of ' + ', '.join(wanted) if wanted else ''
+        self.awaited = f'waiting for a controller{which} in ROS_DOMAIN_ID=' \
+            f'{node.context.get_domain_id()}: bringup prints which one it uses'
         self.by_name: dict[str, ControllerState] = {}
         # Those of all nodes of the domain: some robots have many.
         self._diagnostics = node.listen(
-            DiagnosticArray, topics.DIAGNOSTICS, self._hear, qos=100, polled=True
+            DiagnosticArray, DIAGNOSTICS, self._hear, qos=100, polled=True
         )
         node.every(1.0, self._look)
         self._look()
 
-    @property
-    def awaited(self) -> str:
-        """What is waited for while there is none."""
-        which = ' of ' + ', '.join(self._wanted) if self._wanted else ''
-        domain = self._node.context.get_domain_id()
-        return (
-            f'waiting for a controller{which} in ROS_DOMAIN_ID={domain}: '
-            'bringup prints which one it uses'
-        )
-
-    def take_diagnostics(self) -> None:
+    def take_messages(self) -> None:
+        """Take in what has come since the last call: nothing wakes up for each message."""
         serve_polled(self._diagnostics)
+        for state in self.by_name.values():
+            state.watched.clear()
+            for subscription in state.subscriptions:
+                serve_polled(subscription)
 
     def _hear(self, message: DiagnosticArray, info: dict[str, Any]) -> None:
         for status in message.status:
@@ -159,11 +140,10 @@ class FollowedControllers:
 
     def _look(self) -> None:
         """Whoever publishes what a controller publishes is one."""
-        wanted = tuple(f'{name.rstrip("/")}/' for name in self._wanted) or '/'
         for topic, _ in sorted(self._node.get_topic_names_and_types()):
             # By this a controller is known, or a joint of it.
             found = re.fullmatch(rf'(?P<node>.*)/watch/((?P<joint>[^/]+)/)?{BACKLASH[0]}', topic)
-            if found is None or not f'{found["node"]}/'.startswith(wanted):
+            if found is None or not f'{found["node"]}/'.startswith(self._wanted):
                 continue
             state = ControllerState(found['node'], found['joint'] or '')
             if state.name not in self.by_name:
@@ -188,6 +168,5 @@ def give_way() -> None:
     os.nice(10)
     # Niceness counts only among the processes of one session, see autogroup in sched(7). In this
     # class whoever wakes up does not interrupt one that runs, whatever session that is of.
-    if hasattr(os, 'SCHED_BATCH'):
-        with suppress(OSError):  # some containers do not allow it
-            os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+    with suppress(OSError):  # some containers do not allow it
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))

@@ -36,7 +36,7 @@ class PageServer(ThreadingHTTPServer):
     """Answers each browser in a thread of its own, so that a slow one holds up nobody.
 
     port: 0 for a free one; raises OSError. kept: portions of curves for who has asked last so long
-    ago. began: tells this server from one that was here before.
+    ago.
     """
 
     daemon_threads = True
@@ -44,7 +44,7 @@ class PageServer(ThreadingHTTPServer):
     def __init__(self, port: int, kept: int) -> None:
         super().__init__((HOST, port), PageRequest)
         self.address = f'http://{HOST}:{self.server_address[1]}'
-        self._began = time.time_ns()
+        self._began = time.time_ns()  # tells this server from one that was here before
         self._state, self._count = '{}', 0  # the newest state, how many portions there were
         self._portions: deque[str] = deque(maxlen=kept)
         self._lock = Lock()
@@ -95,18 +95,15 @@ class PageRequest(BaseHTTPRequestHandler):
 
     def _answer(self, kind: str, content: bytes) -> None:
         self.send_response(HTTPStatus.OK)
-        for name, value in (('Content-Type', f'{kind}; charset=utf-8'),
-                            ('Content-Length', str(len(content))), ('Cache-Control', 'no-store')):
-            self.send_header(name, value)
+        self.send_header('Content-Type', f'{kind}; charset=utf-8')
+        self.send_header('Content-Length', str(len(content)))
+        self.send_header('Cache-Control', 'no-store')
         self.end_headers()
         self.wfile.write(content)
 
 
 class LiveNode(ProcessNode):
-    """Shows the controllers that are wanted, as FollowedControllers knows them.
-
-    shown_s: width of the curves.
-    """
+    """Shows the controllers that are wanted, with curves that are shown_s [s] wide."""
 
     def __init__(self, wanted: Sequence[str], server: PageServer, shown_s: float) -> None:
         super().__init__('live')
@@ -124,25 +121,22 @@ class LiveNode(ProcessNode):
         due_s = time.monotonic()
         while not self.stopping:
             executor.spin_once(timeout_sec=0.0)  # the look for further controllers
-            self._followed.take_diagnostics()
+            self._followed.take_messages()
             states, now_s = self._followed.by_name, time.monotonic()
-            curves = {name: self._points_of(state) for name, state in states.items()}
             self._server.add({
                 'now': self._seconds(time.time_ns()), 'shown': self._shown_s,
                 'awaited': self._followed.awaited,
                 'controllers': [content_of(states[name], now_s) for name in sorted(states)],
-            }, curves)
+            }, {name: self._points_of(state) for name, state in states.items()})
             now_s = time.monotonic()
             due_s = max(due_s + PAGE_PERIOD_S, now_s)
             time.sleep(due_s - now_s)
         self._server.shutdown()
 
-    def _points_of(
-        self, state: followed.ControllerState,
-    ) -> dict[str, list[tuple[float, float | None]]]:
+    def _points_of(self, state: followed.ControllerState) -> dict[str, list[object]]:
         """What has come of each curve: time of arrival [s] and value."""
-        points: dict[str, list[tuple[float, float | None]]] = {}
-        for label, at_ns, value in state.watch():
+        points: dict[str, list[object]] = {}
+        for label, at_ns, value in state.watched:
             points.setdefault(label, []).append((self._seconds(at_ns), rounded(value)))
         return points
 

@@ -14,26 +14,26 @@ import termios
 import time
 import tty
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from io import TextIOWrapper
 from math import floor, isfinite, isnan, log10
 from textwrap import wrap
 from typing import Any
 
 from rclpy.utilities import remove_ros_args
-from rich import live as rich_live
 from rich.console import Console, Group
+from rich.live import Live
 from rich.panel import Panel
 from rich.text import Text
 from std_srvs.srv import SetBool, Trigger
 
 from backlash_ros.nodes import followed
+from backlash_ros.nodes.followed import ControllerState
 from backlash_ros.nodes.runtime.executor import PromptExecutor
 from backlash_ros.nodes.runtime.process import ProcessNode, ros_arguments, run
 from backlash_ros.topics import BACKLASH
 
 SCREEN_PERIOD_S = 0.2
-NOTICE_S = 3.0  # for which a notice is shown, and a second r resets
 # By key: the service, and the switch of the diagnostics that it turns over.
 ACTIONS = {
     'f': ('freeze_adaptation', 'learning'), 'c': ('enable_compensation', 'compensating'),
@@ -50,46 +50,45 @@ class MonitorNode(ProcessNode):
         self._followed = followed.FollowedControllers(self, wanted, BACKLASH, depth=1)
         self._selected = 0
         self._notice, self._notice_ends_s = '', 0.0
-        self._confirmed_until_s = 0.0  # a second r resets
 
     def work(self, executor: PromptExecutor) -> None:
         if isinstance(sys.stdout, TextIOWrapper):
             sys.stdout.reconfigure(errors='replace')  # whatever a terminal cannot show
         console = Console()
-        with suppress(BrokenPipeError):
+        try:
             if console.is_terminal and not console.is_dumb_terminal:
                 self._show(executor, console)
             else:
                 self._print_lines(executor)
-            return
-        # Python would complain of the broken pipe once more when it flushes at its end.
-        sys.stdout = open('/dev/null', 'w')  # noqa: SIM115
+        except BrokenPipeError:
+            # Python would complain of it once more when it flushes at its end.
+            sys.stdout = open('/dev/null', 'w')  # noqa: SIM115
 
-    @property
-    def _states(self) -> list[followed.ControllerState]:
+    def _states(self) -> list[ControllerState]:
+        self._followed.take_messages()
         return list(self._followed.by_name.values())
 
     def _show(self, executor: PromptExecutor, console: Console) -> None:
-        blocks = BAR if console.encoding.startswith('utf') else '#=.'
-        with pressed_keys() as keys, rich_live.Live(
+        with pressed_keys() as keys, Live(
             console=console, screen=True, auto_refresh=False, redirect_stdout=False,
             redirect_stderr=False,
         ) as live:
             while not self.stopping:
-                self._refresh()
-                now_s = time.monotonic()
-                notice = self._notice if now_s < self._notice_ends_s \
-                    else '' if self._states else self._followed.awaited
+                states, now_s = self._states(), time.monotonic()
+                if now_s > self._notice_ends_s:
+                    self._notice = '' if states else self._followed.awaited
                 live.update(screen(
-                    self._states, self._selected, notice, now_s, console.width, console.height,
-                    blocks,
+                    states, self._selected, self._notice, now_s, console.width, console.height,
                 ), refresh=True)
                 pressed = ''
                 while not (pressed or self.stopping or time.monotonic() > now_s + SCREEN_PERIOD_S):
                     executor.spin_once(timeout_sec=SCREEN_PERIOD_S / 4)
                     pressed = keys()
                 for key in pressed:
-                    self._on_key(key, executor)
+                    if key == 'q':
+                        signal.raise_signal(signal.SIGINT)
+                    elif states:
+                        self._on_key(key, executor, states)
 
     def _print_lines(self, executor: PromptExecutor) -> None:
         due_s = time.monotonic() + 1.0
@@ -97,57 +96,50 @@ class MonitorNode(ProcessNode):
             executor.spin_once(timeout_sec=SCREEN_PERIOD_S)
             if time.monotonic() >= due_s:
                 due_s += 1.0
-                self._refresh()
-                lines = [plain_line(state, time.monotonic()) for state in self._states]
+                lines = [plain_line(state, time.monotonic()) for state in self._states()]
                 print('\n'.join(lines) or self._followed.awaited, flush=True)
 
-    def _refresh(self) -> None:
-        self._followed.take_diagnostics()
-        for state in self._states:
-            state.watch()
+    def _on_key(self, key: str, executor: PromptExecutor, states: list[ControllerState]) -> None:
+        state = states[self._selected]
+        asked = f'press r once more to reset the estimates of {state.name}'
+        if key == '\t':
+            self._selected, self._notice = (self._selected + 1) % len(states), ''
+        elif key == 'r' and self._notice != asked:
+            self._say(asked)
+        elif key in ACTIONS:
+            text = self._answer_of(executor, state, *ACTIONS[key])
+            state.note(text)
+            self._say(f'{state.name}: {text}')
 
-    def _on_key(self, key: str, executor: PromptExecutor) -> None:
-        if key == 'q':
-            signal.raise_signal(signal.SIGINT)
-        elif key == '\t' and self._states:
-            self._selected = (self._selected + 1) % len(self._states)
-            self._confirmed_until_s = 0.0
-        elif key == 'r' and self._states and time.monotonic() > self._confirmed_until_s:
-            self._confirmed_until_s = time.monotonic() + NOTICE_S
-            name = self._states[self._selected].name
-            self._say(f'press r once more to reset the estimates of {name}')
-        elif key in ACTIONS and self._states:
-            self._confirmed_until_s = 0.0
-            self._call(executor, self._states[self._selected], *ACTIONS[key])
+    def _say(self, text: str) -> None:
+        self._notice, self._notice_ends_s = text, time.monotonic() + 3.0
 
-    def _call(
-        self, executor: PromptExecutor, state: followed.ControllerState, service: str, switch: str,
-    ) -> None:
-        """Call a service and show what it answers; the screen waits so long."""
-        name, on = f'{state.node}/{service}', not state.is_on(switch)
+    def _answer_of(
+        self, executor: PromptExecutor, state: ControllerState, service: str, switch: str,
+    ) -> str:
+        """What a service answers, or why it does not; the screen waits so long."""
+        name, on, patience_s = f'{state.node}/{service}', not state.is_on(switch), 2.0
         request: Any = Trigger.Request()
         if switch:
             request = SetBool.Request(data=on if service == 'enable_compensation' else not on)
         client = self.create_client(SetBool if switch else Trigger, name)
-        text, patience_s = f'{name} is not there', 2.0
-        if client.wait_for_service(patience_s):
-            text, until_s = f'no answer within {patience_s:g} s', time.monotonic() + patience_s
-            answer = client.call_async(request)
+        try:
+            if not client.wait_for_service(patience_s):
+                return f'{name} is not there'
+            until_s, answer = time.monotonic() + patience_s, client.call_async(request)
             while not (answer.done() or self.stopping or time.monotonic() > until_s):
                 executor.spin_once(timeout_sec=SCREEN_PERIOD_S / 4)
-            if answer.done() and (response := answer.result()):
-                text = response.message
-                if switch and response.success:
-                    state.values[switch] = str(on)  # the next diagnostics may be a second away
-        self.destroy_client(client)
-        state.note(text)
-        self._say(f'{state.name}: {text}')
-
-    def _say(self, text: str) -> None:
-        self._notice, self._notice_ends_s = text, time.monotonic() + NOTICE_S
+            response = answer.result()
+            if response is None:
+                return f'no answer within {patience_s:g} s'
+            if switch and response.success:
+                state.values[switch] = str(on)  # the next diagnostics may be a second away
+            return str(response.message)
+        finally:
+            self.destroy_client(client)
 
 
-def bar(value: float, half_width: float, scale: float, width: int, blocks: str = BAR) -> str:
+def bar(value: float, half_width: float, scale: float, width: int) -> str:
     """A bar from 0 to |value| on an axis that ends at `scale`, its band in another shade.
 
     Empty where value or scale is nothing to draw. A band that is there takes a column at least.
@@ -161,7 +153,7 @@ def bar(value: float, half_width: float, scale: float, width: int, blocks: str =
     if half > 0.0 and begins == ends:
         begins = max(begins - 1, 0)
         ends = begins + 1
-    return blocks[0] * begins + blocks[1] * (ends - begins) + blocks[2] * (width - ends)
+    return BAR[0] * begins + BAR[1] * (ends - begins) + BAR[2] * (width - ends)
 
 
 def axis_end(largest: float) -> float:
@@ -173,47 +165,43 @@ def axis_end(largest: float) -> float:
 
 
 def screen(
-    states: Sequence[followed.ControllerState], selected: int, notice: str, now_s: float,
-    width: int, height: int, blocks: str = BAR,
+    states: Sequence[ControllerState], selected: int, notice: str, now_s: float, width: int,
+    height: int,
 ) -> Group:
     """All controllers; where there is no room, all but the selected one in a line each.
 
     notice: in place of the keys. now_s: on the steady clock. width, height: of the terminal.
     """
     panel_lines = 10  # lines of a controller without events, its frame included
-    keys = 'f freeze/learn  c compensate  r reset  s save  q quit'
     several = len(states) > 1
+    keys = 'f freeze/learn  c compensate  r reset  s save  q quit'
     below = wrap(notice or ('Tab next  ' if several else '') + keys, width)
     room = height - len(below)
     every = len(states) * panel_lines <= room
     long = room // max(len(states), 1) if every else room - (len(states) - 1)
-    parts: list[Panel | Text] = []
-    for i, state in enumerate(states):
-        if every or i == selected:
-            chosen = several and i == selected
-            parts.append(_panel(state, now_s, width, long - panel_lines, chosen, blocks))
-        else:
-            parts.append(Text(plain_line(state, now_s)[:width], no_wrap=True, overflow='crop'))
-    parts += [Text(line, 'bold' if notice else 'dim', no_wrap=True, overflow='crop')
-              for line in below]
-    return Group(*parts)
+    return Group(*(
+        _panel(state, now_s, width, long - panel_lines, several and i == selected)
+        if every or i == selected else _cropped(plain_line(state, now_s))
+        for i, state in enumerate(states)
+    ), *(_cropped((line, 'bold' if notice else 'dim')) for line in below))
 
 
-def plain_line(state: followed.ControllerState, now_s: float) -> str:
+def _cropped(*parts: str | tuple[str, str]) -> Text:
+    return Text.assemble(*parts, no_wrap=True, overflow='crop')
+
+
+def plain_line(state: ControllerState, now_s: float) -> str:
     known = [name for name in BACKLASH if isfinite(state.estimates[name][0])]
-    figures = (
-        f'excitation {state.excitation:.3g}, latency {state.number("latency p50 [ms]"):.3g} ms, '
-        f'lost {state.values.get("lost")}' if 'samples' in state.values else ''
-    )
-    return '; '.join(filter(None, [
-        f'{state.name}: {state.word(now_s)}',
-        ', '.join(f'{name} {_with_band(state, name)}' for name in known), figures,
-    ]))
+    parts = [f'{state.name}: {state.word(now_s)}',
+             ', '.join(f'{name} {_with_band(state, name)}' for name in known)]
+    if 'samples' in state.values:
+        parts.append(f'excitation {state.excitation:.3g}, latency '
+                     f'{state.number("latency p50 [ms]"):.3g} ms, lost {state.values.get("lost")}')
+    return '; '.join(filter(None, parts))
 
 
 def _panel(
-    state: followed.ControllerState, now_s: float, width: int, events: int, chosen: bool,
-    blocks: str,
+    state: ControllerState, now_s: float, width: int, events: int, chosen: bool,
 ) -> Panel:
     """One controller in a frame. events: how many of the newest ones."""
     inner, values, number = width - 4, state.values, state.number
@@ -221,12 +209,11 @@ def _panel(
     # Often the cure stands in the second line.
     lines = [*wrap(state.message, inner), '', ''][:2]
     for name in BACKLASH:
-        value, half = state.estimates[name]
         end = axis_end(state.scales[name])
         axis = f' {"-" if name == "c_l" else ""}{end:g}' if end else ''
         before = f'{name:<4}{_with_band(state, name, 11)}'.ljust(32)
-        drawn = bar(value, half, end, max(inner - len(before) - len(axis), 0), blocks)
-        lines.append(f'{before}{drawn}{axis}')
+        room = max(inner - len(before) - len(axis), 0)
+        lines.append(before + bar(*state.estimates[name], end, room) + axis)
     lines += [
         f'excitation {state.excitation:.3g} gaps   {number("rate [Hz]"):.4g} Hz   '
         f'latency {number("latency p50 [ms]"):.3g} ms, p99 {number("latency p99 [ms]"):.3g} ms',
@@ -235,10 +222,9 @@ def _panel(
         f'{"" if state.is_on("compensating") else "not "}compensating',
     ] if 'samples' in values else ['', '']
     newest = list(state.events)[max(len(state.events) - events, 0):]
-    text = Text.assemble(
+    text = _cropped(
         (state.word(now_s), f'bold {colour}'), *(f'\n{line}' for line in lines),
         *((f'\n{clock} {event}'[:inner + 1], 'dim') for clock, event in newest),
-        no_wrap=True, overflow='crop',
     )
     return Panel(
         text, title=f'> {state.name}' if chosen else state.name, title_align='left', width=width,
@@ -246,7 +232,7 @@ def _panel(
     )
 
 
-def _with_band(state: followed.ControllerState, name: str, width: int = 0) -> str:
+def _with_band(state: ControllerState, name: str, width: int = 0) -> str:
     value, half = state.estimates[name]
     return f'{value:>{width}.5g}' + (f' ± {half:.2g}' if isfinite(half) else '')
 

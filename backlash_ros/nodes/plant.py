@@ -16,48 +16,11 @@ from std_msgs.msg import Float64
 
 from backlash_ros import topics
 from backlash_ros.core.loop.command_history import HeldControl
-from backlash_ros.core.parameters import PLANT, Parameters
+from backlash_ros.core.parameters import PLANT
 from backlash_ros.core.scenario import build_plant
 from backlash_ros.nodes.runtime import messages
 from backlash_ros.nodes.runtime.executor import PromptExecutor
 from backlash_ros.nodes.runtime.process import ProcessNode, emit, run
-
-
-class PlantTopics:
-    """What the plant publishes of each sample: y at once, the truth after it.
-
-    outputs: how many y have left. newest: sample of the newest of these.
-    """
-
-    def __init__(self, node: ProcessNode) -> None:
-        self.applied = node.create_publisher(Float64, topics.APPLIED_CONTROL, messages.DEPTH)
-        self._output = node.create_publisher(Float64, topics.PLANT_OUTPUT, messages.DEPTH)
-        self._truth = messages.LabelledArrayPublisher(
-            node, topics.of_node(topics.TRUTH), topics.TRUTH_LABELS
-        )
-        self._clock = node.create_publisher(Clock, topics.CLOCK, messages.KEPT_QOS) \
-            if node.settings.lockstep else None
-        self.truth_rows: list[tuple[float, ...]] = []  # that wait until y has left
-        self.outputs, self.newest = 0, -1
-
-    def has_listeners(self, wanted: int) -> bool:
-        """Whether so many listen to y; one of several is a recorder, which wants everything."""
-        recorders = int(wanted > 1)
-        return self._truth.listeners >= recorders \
-            and self.applied.get_subscription_count() >= recorders \
-            and self._output.get_subscription_count() >= wanted
-
-    def publish_output(self, y: float, sample: int, time_s: float) -> None:
-        """Publish y of a sample, in lockstep after the simulated time."""
-        if self._clock is not None:
-            self._clock.publish(Clock(clock=Time(nanoseconds=round(time_s * 1e9)).to_msg()))
-        self._output.publish(messages.message_with(y))
-        self.outputs, self.newest = self.outputs + 1, sample
-
-    def publish_truth(self) -> None:
-        for row in self.truth_rows:
-            self._truth.publish(row)
-        self.truth_rows.clear()
 
 
 class PlantNode(ProcessNode):
@@ -65,11 +28,9 @@ class PlantNode(ProcessNode):
 
     Real time: every sample period; where no new v has come, the old one is held. Where the
     process is held up, the plant goes on with the newest v and the outputs that come too late are
-    left out.
-    Lockstep: as soon as v(k) is there; /clock tells the simulated time before every output.
-
-    output_loss: such an output is not published, and in lockstep neither is its tick of /clock:
-    there is nothing else by which simulated time could show the gap.
+    left out. Lockstep: as soon as v(k) is there; /clock tells the simulated time before every
+    output. An output that is lost on purpose has no tick of /clock either: there is nothing else
+    by which simulated time could show the gap.
     """
 
     def __init__(self) -> None:
@@ -82,20 +43,38 @@ class PlantNode(ProcessNode):
         self._held = HeldControl()  # times of arrival on the monotonic clock
         self._heard = self._expecting = False  # a first v; none since the newest output
         self._counts: Counter[str] = Counter()
-        self._published = PlantTopics(self)
+        self._published: Counter[str] = Counter()  # what a recorder can have heard
+        self._outgoing = {
+            topic: self.create_publisher(Float64, topic, messages.DEPTH)
+            for topic in (topics.APPLIED_CONTROL, topics.PLANT_OUTPUT)
+        }
+        if p.lockstep:
+            self._outgoing[topics.CLOCK] = self.create_publisher(
+                Clock, topics.CLOCK, messages.KEPT_QOS
+            )
+        self._truth = messages.LabelledArrayPublisher(
+            self, topics.of_node(topics.TRUTH), topics.TRUTH_LABELS
+        )
+        self._truth_rows: list[tuple[float, ...]] = []  # that wait until y has left
         self.listen(Float64, topics.CONTROL, self._on_control, 1)
-        self.let_parameters_change(build_plant, self._take_up)
-        name, outputs = self.resolve_topic_name, topics.PLANT_OUTPUT
-        wanted = p.wait_for_subscribers
+        self.let_parameters_change(build_plant, lambda _: self._plant.change(self.settings))
+        name, outputs, wanted = \
+            self.resolve_topic_name, topics.PLANT_OUTPUT, p.wait_for_subscribers
         self.log.info(
             f'started: {name(topics.CONTROL)} in, {name(outputs)} out, '
             f'sample_period {p.sample_period:g} s ({1.0 / p.sample_period:.4g} Hz)'
             + (f'; waits for {wanted} subscribers of {outputs}' if wanted else '')
         )
-        self.call_when(
-            lambda: self._published.has_listeners(max(wanted, int(p.lockstep))), self._start,
-            f'subscribers of {outputs}',
+        self.call_when(self._is_heard, self._start, f'subscribers of {outputs}')
+
+    def _is_heard(self) -> bool:
+        """Whether enough listen; one of several is a recorder, which wants everything."""
+        wanted = max(self.settings.wait_for_subscribers, int(self.settings.lockstep))
+        applied, output = (
+            self._outgoing[topic].get_subscription_count()
+            for topic in (topics.APPLIED_CONTROL, topics.PLANT_OUTPUT)
         )
+        return output >= wanted and min(self._truth.listeners, applied) >= int(wanted > 1)
 
     def work(self, executor: PromptExecutor) -> None:
         while not (self._started or self.stopping):
@@ -107,9 +86,6 @@ class PlantNode(ProcessNode):
     def finish(self) -> None:
         counts = ', '.join(f'{count} {what}' for what, count in self._counts.items() if count)
         self.log.info(f'{self._plant.sample} samples' + (f', {counts}' if counts else ''))
-
-    def _take_up(self, before: Parameters) -> None:
-        self._plant.change(self.settings)
 
     def _start(self) -> None:
         self._started = True
@@ -178,19 +154,25 @@ class PlantNode(ProcessNode):
         plant, sample = self._plant, self._plant.sample
         u = plant.step(v)
         truth = plant.backlash
-        self._published.truth_rows.append((u, truth.m, truth.c_r, truth.c_l, v, float(sample)))
-        self._published.applied.publish(messages.message_with(plant.applied))
+        self._truth_rows.append((u, truth.m, truth.c_r, truth.c_l, v, float(sample)))
+        applied = self._outgoing[topics.APPLIED_CONTROL]
+        applied.publish(messages.message_with(plant.applied))
 
     def _publish_output(self, latest_ns: float = inf) -> bool:
         """Measure y, and publish it unless it is lost on purpose or too late."""
-        sample, y, loss = self._plant.sample, self._plant.measure(), self.settings.output_loss
-        if sample > 0 and loss > 0.0 and float(self._loss_rng.random()) < loss:
+        sample, y, p = self._plant.sample, self._plant.measure(), self.settings
+        if sample > 0 and p.output_loss > 0.0 and float(self._loss_rng.random()) < p.output_loss:
             return False
         if time.monotonic_ns() > latest_ns:
             self._counts['missed outputs'] += 1
             return False
         self._expecting = True
-        self._published.publish_output(y, sample, sample * self.settings.sample_period)
+        if p.lockstep:
+            now = Time(nanoseconds=round(sample * p.sample_period * 1e9))
+            self._outgoing[topics.CLOCK].publish(Clock(clock=now.to_msg()))
+        self._outgoing[topics.PLANT_OUTPUT].publish(messages.message_with(y))
+        self._published[topics.PLANT_OUTPUT] += 1
+        self._published['samples'] = sample + 1
         return True
 
     @property
@@ -198,13 +180,12 @@ class PlantNode(ProcessNode):
         return 0 < self.settings.samples <= self._plant.sample
 
     def _end_sample(self) -> None:
-        self._published.publish_truth()
+        for row in self._truth_rows:
+            self._truth.publish(row)
+        self._truth_rows.clear()
         if self._complete:
-            # What a recorder can have heard.
-            emit('done', published={
-                'samples': self._published.newest + 1, topics.PLANT_OUTPUT: self._published.outputs,
-                topics.APPLIED_CONTROL: self._plant.sample, topics.TRUTH: self._plant.sample,
-            })
+            stepped = dict.fromkeys((topics.APPLIED_CONTROL, topics.TRUTH), self._plant.sample)
+            emit('done', published={**self._published, **stepped})
 
 
 main = partial(run, PLANT, PlantNode)

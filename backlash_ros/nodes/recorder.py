@@ -43,14 +43,14 @@ class RecordedTopic:
 
     name: str
     connection: Connection | None = None
-    newest: bytes | None = None  # serialised
+    newest: bytes = b''  # serialised
     received: int = 0
     recorded: int = 0
     missed: int = 0
     sequence: int = UNNUMBERED  # of the newest message
 
 
-def _row(topic: str, message: bytes | None) -> dict[str, float]:
+def _row(topic: str, message: bytes) -> dict[str, float]:
     data = deserialize_message(message, Float64MultiArray).data if message else ()
     return dict(zip(topics.LABELS_OF[topic], data, strict=False))
 
@@ -92,10 +92,15 @@ class RecorderNode(ProcessNode):
         # Lockstep promises every row: that of the first truth leaves as soon as y is subscribed to.
         truth = (topics.TRUTH,) if p.lockstep else ()
         wanted = (topics.ESTIMATES, topics.SIGNALS, *truth, to.reference, to.control)
+
+        def start() -> None:
+            self._record(to.output, to.output_type, output_qos(p, RECORDER_DEPTH))
+            emit('ready')
+
         self.call_when(
             lambda: not p.wait_for_publishers or all(
                 recorded[topic].get_publisher_count() for topic in wanted
-            ), self._start, ', '.join(wanted),
+            ), start, ', '.join(wanted),
         )
 
     def work(self, executor: PromptExecutor) -> None:
@@ -188,11 +193,6 @@ class RecorderNode(ProcessNode):
 
         self._with_bag(announce)
         return subscription
-
-    def _start(self) -> None:
-        to = driver_topics(self.settings)
-        self._record(to.output, to.output_type, output_qos(self.settings, RECORDER_DEPTH))
-        emit('ready')
 
     def _on_message(self, topic: str, message: bytes, info: dict[str, Any]) -> None:
         channel, sequence = self._channels[topic], info['publication_sequence_number']

@@ -47,15 +47,16 @@ class ReferenceNode(ProcessNode):
             Float64, topics.REFERENCE, messages.KEPT_QOS if p.lockstep else messages.DEPTH
         )
         self.let_parameters_change(build_reference, self._take_up)
-        name, listeners = self.resolve_topic_name, p.wait_for_subscribers
+        name, awaited = self.resolve_topic_name, \
+            f'{p.wait_for_subscribers} subscribers of {topics.REFERENCE}'
         self.log.info(
             f'started: {name(self._io.topics.output)} in, {name(topics.REFERENCE)} out: '
             f'{p.waveform}, sample_period {p.sample_period:g} s'
-            + (f'; waits for {listeners} subscribers of {topics.REFERENCE}' if listeners else '')
+            + (f'; waits for {awaited}' if p.wait_for_subscribers else '')
         )
         self.call_when(
-            lambda: self._output.get_subscription_count() >= listeners, self._start,
-            f'{listeners} subscribers of {topics.REFERENCE}',
+            lambda: self._output.get_subscription_count() >= p.wait_for_subscribers, self._start,
+            awaited,
         )
 
     def work(self, executor: PromptExecutor) -> None:
@@ -93,16 +94,13 @@ class ReferenceNode(ProcessNode):
         outputs = self._io.listen(hear, depth=1, polled=True)
         diagnostics = self.listen(
             DiagnosticArray, topics.DIAGNOSTICS, self._hear_diagnostics, 10, polled=True
-        ) if pace.waits else None
+        )
         serve_at = now
         while not self.stopping:
             if now >= serve_at:
                 executor.spin_once(timeout_sec=0.0)
                 serve_at = now + 0.05  # between two looks at signals and requests
-                if diagnostics is not None and not pace.waits:
-                    self.destroy_subscription(diagnostics)
-                    diagnostics = None
-                elif diagnostics is not None:
+                if pace.waits:
                     serve_polled(diagnostics)
                     # Fast DDS may miss a process of another machine for good that starts at the
                     # same moment.
@@ -135,12 +133,10 @@ class ReferenceNode(ProcessNode):
     def _take_up(self, before: Parameters) -> None:
         """Use another signal from the next sample on; a sine goes on without a jump."""
         self._signal = build_reference(self.settings)
+        t, self._offset_s = self._newest * before.sample_period + self._offset_s, 0.0
         if self._signal.waveform in PERIODIC:
-            t = self._newest * before.sample_period
-            phase = before.frequency * (t + self._offset_s)
-            self._offset_s = phase / self._signal.frequency - t
-        else:
-            self._offset_s = 0.0
+            phase = before.frequency * t
+            self._offset_s = phase / self._signal.frequency - self._newest * before.sample_period
 
     def _on_clock(self, message: Clock) -> None:
         time_s = Time.from_msg(message.clock).nanoseconds * 1e-9
