@@ -6,15 +6,12 @@ from dataclasses import replace
 from math import nan
 
 import numpy as np
-from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.law import Interval, Law
 from backlash_ros.core.plant.backlash import Backlash
 from backlash_ros.core.plant.numerics import NoiseLevel
-from backlash_ros.core.plant.transfer_function import StateModel
-
-Array = NDArray[np.float64]
+from backlash_ros.core.plant.transfer_function import Array, StateModel
 
 
 class FixedBacklash(Law):
@@ -44,12 +41,10 @@ class FixedBacklash(Law):
         self._u, self._started = 0.0, False
 
     def with_model(self, model: StateModel) -> FixedBacklash:
-        """The same for another G, the state of which is not known yet."""
         return FixedBacklash(self.estimate, model, self._noise_var**0.5, self._doubt)
 
     @property
     def u_hat(self) -> float:
-        """u of the given backlash plus the estimated disturbance."""
         return self._u + float(self._x[-1])
 
     @property

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Bounds, Estimate, Status
 from backlash_ros.core.law import Interval, Law
-from backlash_ros.core.laws.agreement import LEAST_SQUARE, MEMORY, Agreement
+from backlash_ros.core.laws.input_reconstruction import LEAST_SQUARE, MEMORY, Agreement
 from backlash_ros.core.plant.numerics import FourBlocks
 
 Array = NDArray[np.float64]

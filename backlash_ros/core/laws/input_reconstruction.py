@@ -3,31 +3,44 @@
 A fixed-lag Kalman smoother of a random walk u(k+1) = u(k) + w in front of G. Looking back makes the
 inversion stable: an unstable zero z0 is inverted backwards in time, where it decays like |z0|^-lag.
 Reference: B. D. O. Anderson, J. B. Moore, Optimal Filtering, Prentice-Hall 1979, section 7.3.
+
+Whether estimates of these laws, which have no deviations, agree with what was measured lately: u,
+or what is made of it linearly, is t = theta' phi for the true theta = (m, m c_r, m c_l). With
+R = E{phi phi'} over many samples, and phi scaled to E{phi_i^2} = 1, the estimates may be wrong by
+
+    |theta - theta_hat|^2 <= E{(t - theta_hat' phi)^2} / (smallest eigenvalue of R)
 """
 
 from collections import deque
+from collections.abc import Sequence
+from dataclasses import replace
 from math import inf, nan, sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
-from backlash_ros.core.estimate import Bounds, Estimate
+from backlash_ros.core.estimate import Bounds, Estimate, Status
 from backlash_ros.core.law import Interval, Law
-from backlash_ros.core.laws.agreement import Agreement
 from backlash_ros.core.parameters import ParameterError
-from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction, check_model
+from backlash_ros.core.plant.transfer_function import (
+    Array,
+    StateModel,
+    TransferFunction,
+    check_model,
+)
 
-Array = NDArray[np.float64]
-
+# Square of a signal below which it counts as none. Its inverse, times the square of any
+# measurement, still is a number.
+LEAST_SQUARE = 1e-240
+MEMORY = 200  # samples over which means are taken, with weights that fade
+LEAST_SAMPLES, EVERY = 100, 20  # before the first judgement, and from one to the next
 STROKE = 8  # samples to either side over which u moves on in one direction
 
 
 class InputReconstruction:
     """Fixed-lag smoother: u_hat(k - lag) from y(..k).
 
-    noise_std: standard deviation of the noise on y. lag: samples, no less than the delay of G.
-    smoothed: share of the noise that is smoothed away. std: standard deviation of u_hat while no
-    sample is lost. Raises ParameterError, also where so much noise leaves nothing but rounding.
+    noise_std: of y, of which a share `smoothed` is smoothed away. std: of u_hat while no sample is
+    lost. Raises ParameterError, also where so much noise leaves nothing but rounding.
     """
 
     def __init__(
@@ -90,7 +103,6 @@ class InputReconstruction:
 
     @property
     def u_hat(self) -> float:
-        """u_hat(k - lag) given y(..k)."""
         return float(self._z[-1])
 
     def newer(self, samples: int) -> float:
@@ -138,6 +150,65 @@ class InputReconstruction:
         return np.asarray(0.5 * (p + p.T))
 
 
+class Agreement:
+    """Means of the products of phi and t, by which estimates are judged.
+
+    status: TRACKING while no theta that explains the samples differs from the estimate that was
+    judged last, nor this one from the newest, by more than a tenth of what the crossings make of t;
+    INCONSISTENT where the samples ask for a negative slope; ACQUIRING otherwise.
+    """
+
+    def __init__(self) -> None:
+        self.status = Status.ACQUIRING
+        self._samples = 0
+        self._rows: list[Sequence[float]] = []  # (phi, t) since the means were taken
+        self._products = np.zeros((4, 4))  # means of (phi, t)(phi, t)'
+        # Products judged last, the weights of their errors, and the largest sum of squares.
+        self._judged, self._weights, self._most = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0
+
+    def judged(self, new: Estimate, row: Sequence[float]) -> Estimate:
+        """The estimate with its status, after the three elements of phi, and t, of this sample."""
+        theta = new.m, new.m * new.c_r, new.m * new.c_l
+        self._rows.append(row)
+        if len(self._rows) == EVERY:
+            self._samples += EVERY
+            rows, self._rows = np.array(self._rows), []
+            share = EVERY / min(self._samples, MEMORY)
+            self._products += share * (rows.T @ rows / EVERY - self._products)
+            if self._samples >= LEAST_SAMPLES:
+                self.status = self._judge(theta)
+        elif self.status is Status.TRACKING:
+            moved = zip(theta, self._judged, self._weights, strict=True)
+            if sum((weight * (now - then)) ** 2 for now, then, weight in moved) > self._most:
+                self.status = Status.ACQUIRING
+        return replace(new, status=self.status)
+
+    def _judge(self, theta: tuple[float, float, float]) -> Status:
+        size = np.sqrt(np.diag(self._products)[:3])
+        if float(size.min()) ** 2 <= LEAST_SQUARE:
+            return Status.ACQUIRING
+        eigenvalues, vectors = np.linalg.eigh(self._products[:3, :3] / np.outer(size, size))
+        least, largest = float(eigenvalues[0]), float(eigenvalues[-1])
+        # No more than the rounding of the sums: the samples do not tell one theta from all others.
+        if least <= 1e-12 * largest:
+            return Status.ACQUIRING
+        most = 0.1**2 * float((theta[1] * size[1]) ** 2 + (theta[2] * size[2]) ** 2)
+        if self._mean_square(np.array(theta)) <= least * most:
+            self._judged, self._most, self._weights = theta, most, tuple(size.tolist())
+            return Status.TRACKING
+        # With R = Q diag(l) Q' this is R^-1, positive definite whatever rounding does to R.
+        inverse = (vectors / eigenvalues) @ vectors.T
+        best = inverse @ (self._products[:3, 3] / size) / size
+        variance = self._mean_square(best) * float(inverse[0, 0])
+        deviation = sqrt(variance / min(self._samples, MEMORY)) / float(size[0])
+        return Status.INCONSISTENT if float(best[0]) < -5.0 * deviation else Status.ACQUIRING
+
+    def _mean_square(self, theta: Array) -> float:
+        """Mean of (t - theta' phi)^2."""
+        weights = np.append(-theta, 1.0)
+        return max(float(weights @ self._products @ weights), 0.0)
+
+
 class LaggedLaw(Law):
     """Learns from u reconstructed some samples late, and what was applied when it acted."""
 
@@ -153,7 +224,6 @@ class LaggedLaw(Law):
 
     @property
     def u_hat(self) -> float:
-        """Reconstruction of u, `lag` samples old."""
         return self._reconstruction.u_hat
 
     @property
@@ -178,15 +248,13 @@ class LaggedLaw(Law):
             self.estimate = self._agreement.judged(self.estimate, row)
 
     def _learned(self, u: float, past: Interval, rising: bool | None) -> Estimate:
-        """The estimate after u, and what was applied with it."""
         raise NotImplementedError
 
     def _rising(self, u: float) -> bool | None:
         """Whether u moves on the right line (True) or the left one; None where it may rest.
 
-        u rises only on the right line and falls only on the left one, so that no wrong side can
-        lock in. It counts as moving on by two deviations of its error, as smoothing rounds the
-        corners, and at no less than a quarter of the mean pace of the stroke.
+        It counts as moving by two deviations of its error, as smoothing rounds the corners, and at
+        no less than a quarter of the mean pace of the stroke.
         """
         ahead, behind = self._reconstruction.newer(STROKE) - u, u - self._past[0]
         step, rising = u - self._past[-2], True

@@ -13,8 +13,11 @@ Reference: S. Haykin, Adaptive Filter Theory, Prentice-Hall 1996, chapter 9 (the
 
 from backlash_ros.core.estimate import Bounds, Estimate, Status
 from backlash_ros.core.law import Interval
-from backlash_ros.core.laws.agreement import LEAST_SQUARE
-from backlash_ros.core.laws.input_reconstruction import InputReconstruction, LaggedLaw
+from backlash_ros.core.laws.input_reconstruction import (
+    LEAST_SQUARE,
+    InputReconstruction,
+    LaggedLaw,
+)
 from backlash_ros.core.parameters import Parameters
 
 

@@ -9,13 +9,10 @@ load winds the loop up by w before the load moves: until then v stays where it t
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from backlash_ros.core.parameters import ParameterError
 from backlash_ros.core.plant.backlash import clamp
-from backlash_ros.core.plant.transfer_function import TransferFunction
-
-Array = NDArray[np.float64]
+from backlash_ros.core.plant.transfer_function import Array, TransferFunction
 
 
 @dataclass(frozen=True)

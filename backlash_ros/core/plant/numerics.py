@@ -1,10 +1,8 @@
 """Linear filters, Riccati and Lyapunov equations, pole placement, and the noise of a signal.
 
-scipy.signal takes a node 0.3 s of its start and 40 MB, scipy.linalg 31 MB, so that the equations
-are solved here, by doubling.
-
-Reference: E. K.-W. Chu, H.-Y. Fan, W.-W. Lin, C.-S. Wang, Structure-preserving algorithms for
-periodic discrete-time algebraic Riccati equations, Int. J. Control 77 (2004) 767-788.
+scipy.signal takes a node 0.3 s of its start and 40 MB, scipy.linalg 31 MB: they are loaded late.
+Reference: E. K.-W. Chu et al., Structure-preserving algorithms for periodic discrete-time algebraic
+Riccati equations, Int. J. Control 77 (2004) 767-788.
 """
 
 from bisect import bisect_left, insort
@@ -13,12 +11,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from backlash_ros.core.parameters import ParameterError
-from backlash_ros.core.plant.transfer_function import TransferFunction
-
-Array = NDArray[np.float64]
+from backlash_ros.core.plant.transfer_function import Array, TransferFunction
 
 
 def lfilter(
@@ -85,8 +81,7 @@ class FourBlocks(NamedTuple):
         w_1 = a(z)/Lambda(z) u_d,   w_2 = a(z)/Lambda(z) y,   a = (z^(n-2), ..., z, 1)'
 
     filter: Lambda, shape (n,). reference: theta_3 B/A_m from r to y. disturbance: W from u - u_d
-    to y. returned: B R/(Lambda A_m), so that y + returned y = W u whatever makes u. demand:
-    theta_3 A/A_m from r to u_d, coefficients of numerator and denominator.
+    to y. returned: B R/(Lambda A_m). demand: theta_3 A/A_m from r to u_d, its coefficients.
     """
 
     theta_1: Array
@@ -113,13 +108,13 @@ def place_poles(model: TransferFunction, closed: Array, filter_pole: float) -> F
     """
     n, a, b = model.order, model.denominator, model.numerator[1:]
     placed = np.atleast_1d(np.poly(np.full(n - 1, filter_pole)))
+    product = np.convolve(placed, closed)
     # Sylvester matrix: columns are A and -B shifted by the unknown coefficients of S and R.
     sylvester = np.zeros((2 * n - 1, 2 * n - 1))
     for i in range(n - 1):
         sylvester[i:i + n + 1, i] = a[:2 * n - 1 - i]
     for i in range(n):
         sylvester[i:i + n, n - 1 + i] = -b
-    product = np.convolve(placed, closed)
     known = np.convolve(a, np.eye(1, n)[0])  # S is monic: A z^(n-1) is on the left already
     right = (product - known)[1:]
     unknown = np.linalg.lstsq(sylvester, right, rcond=None)[0]
@@ -160,7 +155,6 @@ class NoiseLevel:
         return 1.0 / (924.0**0.5 * 0.6745) * self._sorted[count // 2] if count >= 15 else 0.0
 
     def take(self, value: float) -> None:
-        """Take in the next sample."""
         self._signal.append(value)
         if len(self._signal) < 7:
             return

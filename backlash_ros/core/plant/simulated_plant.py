@@ -12,22 +12,18 @@ import warnings
 from math import sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
 from backlash_ros.core.parameters import ParameterError, Parameters
 from backlash_ros.core.plant.actuator import Actuator, Motor
 from backlash_ros.core.plant.backlash import Backlash
-from backlash_ros.core.plant.transfer_function import Roots, TransferFunction
-
-Array = NDArray[np.float64]
+from backlash_ros.core.plant.transfer_function import Array, Roots, TransferFunction
 
 
 class SimulatedPlant:
     """y = G(z) (B[v] + d + w), measured with noise and a quantum.
 
-    d is constant, w a random walk, w(k+1) = w(k) + walk_std sqrt(T) N(0, 1), w(0) = 0. model: the
-    true G(z). actuator: what makes v of the command, None where they are one. applied: the newest
-    v. sample: number of the next one.
+    d is constant, w a random walk, w(k+1) = w(k) + walk_std sqrt(T) N(0, 1). model: the true G(z).
+    actuator: makes v of the command. applied: the newest v. sample: number of the next one.
     """
 
     def __init__(
@@ -39,13 +35,12 @@ class SimulatedPlant:
         self._p, self._model, self._x = p, model, [0.0] * model.order
         self._motor = None if actuator is None else Motor(actuator)
         self._rng = np.random.default_rng(p.seed)
-        self._walk, self._walk_step = 0.0, p.truth.walk_std * sqrt(p.sample_period)
         # Draws of their own: the noise on y is the same with and without a walk.
-        self._walk_rng = self._rng.spawn(1)[0] if self._walk_step > 0.0 else self._rng
+        self._walk_rng = self._rng.spawn(1)[0]
+        self._walk, self._walk_step = 0.0, p.truth.walk_std * sqrt(p.sample_period)
 
     @property
     def disturbance(self) -> float:
-        """What is added to u: a constant and a walk."""
         return self._p.input_disturbance + self._walk
 
     def change(self, p: Parameters) -> None:
@@ -71,8 +66,7 @@ class SimulatedPlant:
         self.applied = v
         u = self.backlash.step(v)
         self._model.advance(self._x, u + self.disturbance)
-        if self._walk_step > 0.0:
-            self._walk += self._walk_step * float(self._walk_rng.standard_normal())
+        self._walk += self._walk_step * float(self._walk_rng.standard_normal())
         self.sample += 1
         return u
 

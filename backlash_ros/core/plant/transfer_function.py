@@ -29,10 +29,9 @@ class TransferFunction:
         a = _polynomial(f'{group}.denominator', denominator)
         if len(b) >= len(a):
             raise ParameterError(
-                f'{group}.numerator', list(numerator),
-                f'has degree {len(b) - 1}, must be below the degree {len(a) - 1} of '
-                f'{group}.denominator', 'a sampled plant has a delay of at least one sample',
-            )
+                f'{group}.numerator', list(numerator), f'has degree {len(b) - 1}, must be below '
+                f'the degree {len(a) - 1} of {group}.denominator',
+                'a sampled plant has a delay of at least one sample')
         self.numerator = np.concatenate([np.zeros(len(a) - len(b)), b]) / a[0]
         self.denominator = a / a[0]
         self.order = len(a) - 1
@@ -41,13 +40,7 @@ class TransferFunction:
 
     @cached_property
     def poles(self) -> Roots:
-        """Roots of the denominator, shape (n,)."""
         return np.asarray(np.roots(self.denominator), dtype=np.complex128)
-
-    @property
-    def zeros(self) -> Roots:
-        """Roots of the numerator."""
-        return np.asarray(np.roots(self.numerator), dtype=np.complex128)
 
     @property
     def delay(self) -> int:
@@ -56,18 +49,14 @@ class TransferFunction:
 
     def response(self, z: Roots) -> Roots:
         """G at the points z."""
-        value = np.polyval(self.numerator, z) / np.polyval(self.denominator, z)
-        return np.asarray(value, dtype=np.complex128)
+        return np.asarray(np.polyval(self.numerator, z) / np.polyval(self.denominator, z))
 
     def without_delay(self) -> tuple[list[float], list[float], int]:
-        """Numerator, denominator and delay [samples] of z^-delay numerator / denominator.
-
-        The whole delay, as far as the rest is still a G(z) that one can be told.
-        """
-        at_zero = len(self.denominator) - len(np.trim_zeros(self.denominator, 'b'))
-        delay = min(at_zero, self.delay - 1)
-        denominator = self.denominator[:len(self.denominator) - delay]
-        return np.trim_zeros(self.numerator, 'f').tolist(), denominator.tolist(), delay
+        """b, a and d [samples], as large as b/a allows that still is a G(z), of z^-d b/a."""
+        size = len(self.denominator)
+        delay = min(size - len(np.trim_zeros(self.denominator, 'b')), self.delay - 1)
+        b, a = np.trim_zeros(self.numerator, 'f'), self.denominator[:size - delay]
+        return b.tolist(), a.tolist(), delay
 
     def state_space(self) -> tuple[Array, Array, Array]:
         """A (n, n), B (n,), C (n,) of x(k+1) = A x + B u, y = C x in observer form: x_0 is y."""
@@ -77,12 +66,8 @@ class TransferFunction:
         return a, self.numerator[1:].copy(), np.eye(n)[0]
 
     def advance(self, x: list[float], u: float) -> float:
-        """Take a state in the observer form over one sample, in place, and return its y.
-
-        Beside so few numbers a call of NumPy takes longer.
-        """
-        y = x[0]
-        last = len(x) - 1
+        """Take a state in the observer form over one sample, in place, and return its y."""
+        y, last = x[0], len(x) - 1  # beside so few numbers a call of NumPy takes longer
         for i, (a, b) in enumerate(self._terms):
             x[i] = (x[i + 1] if i < last else 0.0) + a * y + b * u
         return x[0]
@@ -145,7 +130,7 @@ def check_model(model: TransferFunction) -> None:
                 f'has the unstable pole {_text(pole)}',
                 'close a stabilising loop around the plant first and give its G(z)',
             )
-    for zero in model.zeros:
+    for zero in np.roots(model.numerator):
         near = poles[np.abs(poles - zero) < ON_CIRCLE]
         if near.size and abs(zero) > 1.0 - ON_CIRCLE:
             raise ParameterError(
@@ -167,7 +152,7 @@ def model_warnings(
     """Say what makes the estimate ill-conditioned; frequency: of the reference [rad/s] if known."""
     poles = model.poles
     slow = [_text(pole) for pole in poles if ON_CIRCLE < 1.0 - abs(pole) < 1e-4]
-    circle = [_text(zero) for zero in model.zeros if abs(abs(zero) - 1.0) < 1e-3]
+    circle = [_text(zero) for zero in np.roots(model.numerator) if abs(abs(zero) - 1.0) < 1e-3]
     samples = 2.0 * np.pi / (frequency * sample_period) if frequency is not None else 100.0
     return [text for true, text in (
         (slow, f'the pole {"".join(slow[:1])} is slower than 10000 samples: sample_period='

@@ -23,10 +23,7 @@ from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord, row_of
 
 @dataclass
 class ClosedLoop:
-    """Controller, plant and reference stepped together; row k holds sample k.
-
-    lose: says of each sample whether y(k) is lost on the way. p: G(z) as the parameters have it.
-    """
+    """Controller, plant and reference stepped together. lose: says whether y(k) is lost."""
 
     controller: AdaptiveController
     plant: SimulatedPlant
@@ -54,11 +51,9 @@ class ClosedLoop:
                     t, y, v, u, step, self.controller.estimator, (truth.m, truth.c_r, truth.c_l)))
             if on_sample is not None:
                 on_sample(k)
-        return RunRecord(
-            np.array(values).reshape(-1, len(COLUMNS)), self.sample_period,
-            self.controller.lost_samples + lost,
-            learned_model_of(self.controller.estimator, self.p),
-        )
+        rows, learned = np.array(values), learned_model_of(self.controller.estimator, self.p)
+        return RunRecord(rows.reshape(-1, len(COLUMNS)), self.sample_period,
+                         self.controller.lost_samples + lost, learned)
 
 
 def build_closed_loop(p: Parameters) -> ClosedLoop:
@@ -76,10 +71,8 @@ def replay(
 ) -> RunRecord:
     """Feed y, y_m, v and losses of a record to a controller with these parameters.
 
-    The rows are those of the record, with the recorded y, y_m and v, and what this controller makes
-    of them: u_d, estimates, status, innovation. reports: for each row what the driver said to have
-    applied since the row before it. Raises ValueError for rows without numbers and
-    ParameterError for parameters that contradict each other.
+    reports: for each row what the driver said to have applied since the row before it. Raises
+    ValueError for rows without numbers, ParameterError for parameters that contradict each other.
     """
     t = recorded.column('t')
     columns = [recorded.column(name).tolist() for name in ('y_m', 'y', 'v')]
@@ -120,10 +113,8 @@ def replay(
             on_sample(k)
     for name in ('u', 'true_m', 'true_c_r', 'true_c_l'):  # what no controller can say
         rows[:, COLUMNS.index(name)] = recorded.column(name)
-    return RunRecord(
-        rows, recorded.sample_period, recorded.lost_samples,
-        learned_model_of(controller.estimator, p),
-    )
+    return RunRecord(rows, recorded.sample_period, recorded.lost_samples,
+                     learned_model_of(controller.estimator, p))
 
 
 class Parting(NamedTuple):

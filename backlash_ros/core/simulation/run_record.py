@@ -22,10 +22,7 @@ SETTLING_TOLERANCE = 0.01  # of the true value
 
 
 def stated_deviations(e: Estimate) -> tuple[float, float, float]:
-    """Standard deviations of m, c_r, c_l as they are published and recorded.
-
-    Those of constants that are taken as given are nan: nobody has learned how wrong they are.
-    """
+    """Those of m, c_r, c_l to publish and record: nan for constants that were given."""
     return (nan, nan, nan) if was_given(e) else (e.std_m, e.std_c_r, e.std_c_l)
 
 
@@ -56,17 +53,14 @@ class RunRecord:
     learned: LearnedModel | None = None
 
     def column(self, name: str) -> Array:
-        """One signal by name, shape (N,)."""
         return self.rows[:, COLUMNS.index(name)]
 
     @property
     def samples(self) -> int:
-        """Number of rows N."""
         return len(self.rows)
 
     @property
     def has_truth(self) -> bool:
-        """Whether the true u and backlash are known."""
         return bool(np.isfinite(self.column('true_m')).all()) and self.samples > 0
 
 
@@ -86,20 +80,14 @@ def control_error_rms(run: RunRecord) -> float | None:
 
 
 def delayed_reference(run: RunRecord, delay: int) -> Array:
-    """y_m as it is to be followed: `delay` samples late, and y(0) before, shape (N,).
-
-    Rows of lost samples are missing from a run, so that the delay counts in sample periods.
-    """
+    """y_m, `delay` sample periods late, and y(0) before, shape (N,)."""
     t, y_m = run.column('t'), run.column('y_m')
     newest = np.searchsorted(t, t - (delay - 0.5) * run.sample_period, side='right') - 1
     return np.where(newest >= 0, y_m[np.maximum(newest, 0)], run.column('y')[:1])
 
 
 def delayed_tracking_error_rms(run: RunRecord, delay: int, since: float = 0.0) -> float | None:
-    """RMS of y - y_m(k - delay) over RMS of y_m(k - delay) from time `since` [s] on.
-
-    None for a reference at zero.
-    """
+    """RMS of y - y_m(k - delay) over that of y_m, from `since` [s] on; None for y_m = 0."""
     rows = run.column('t') >= since
     reference = delayed_reference(run, delay)[rows]
     if not np.any(reference):
@@ -109,7 +97,6 @@ def delayed_tracking_error_rms(run: RunRecord, delay: int, since: float = 0.0) -
 
 
 def total_variation(values: Array) -> float:
-    """Way that a signal went, up and down alike."""
     return float(np.abs(np.diff(values)).sum())
 
 
@@ -127,10 +114,9 @@ def turns(values: Array, least: float) -> int:
 
 
 def gap_crossings_per_reversal(run: RunRecord, since: float = 0.0) -> float | None:
-    """Crossings of the gap by v for each reversal of y_m from time `since` [s] on.
+    """Turns of v by more than half the gap for each reversal of y_m, from `since` [s] on.
 
-    v crosses the gap where it turns back by more than half of it: one that falls short is
-    counted, and noise within the gap is not. None without a true gap or without a reversal.
+    None without a true gap or without a reversal.
     """
     rows = run.column('t') >= since
     gap = (run.column('true_c_r') - run.column('true_c_l'))[rows]
