@@ -26,8 +26,7 @@ from reporting import format_table, parser_of
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, Header
 
-from backlash_ros.core.assembly import build_plant
-from backlash_ros.core.parameters import Parameters
+from backlash_ros.core import Parameters, build_plant
 
 JOINTS = tuple(f'joint_{i}' for i in range(1, 7))
 WARM_UP_S = 6.0  # acquisition is not counted

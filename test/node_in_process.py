@@ -23,11 +23,10 @@ from ros_processes import Probe
 from std_srvs.srv import SetBool, Trigger
 from waiting import wait_until
 
-from backlash_ros.core.assembly import build_plant, build_reference
+from backlash_ros.core import Parameters, build_plant, build_reference
 from backlash_ros.core.jobs import Executor
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.sample_counter import Output
-from backlash_ros.core.parameters import Parameters
 from backlash_ros.middleware import prefer_loopback
 from backlash_ros.nodes.controller import ControllerNode
 from backlash_ros.nodes.runtime.executor import PromptExecutor

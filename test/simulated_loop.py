@@ -9,10 +9,9 @@ import numpy as np
 from fault_loop.fault_controller import Controller
 from fault_loop.fault_world import Actuator, Driver, Sensor
 
-from backlash_ros.core.estimate import Estimate
+from backlash_ros.core import Estimate, Parameters
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.sample_counter import Output
-from backlash_ros.core.parameters import Parameters
 
 NOISE = 1e-3
 TRUTH = np.array([1.3, 3.0, -3.0])  # m, c_r, c_l of the paper's example

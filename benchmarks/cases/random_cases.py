@@ -10,9 +10,8 @@ from reporting import Array
 from scipy import linalg, signal
 from scipy.signal import lfilter
 
+from backlash_ros.core import Parameters, build_closed_loop
 from backlash_ros.core.assembly import build_true_model
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.simulation.closed_loop import build_closed_loop
 
 SINGULAR = 1e-13  # of the largest singular value: a direction that y does not show
 

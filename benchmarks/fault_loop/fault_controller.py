@@ -7,15 +7,14 @@ from math import nan
 import numpy as np
 from fault_loop.fault_world import Actuator, Driver, Sensor
 
+from backlash_ros.core import Estimate, Parameters
 from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.control.limits import Limits
-from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.control_loop import Driver as Asked
 from backlash_ros.core.loop.diagnosis import Level, Neighbours, figures_of_loop, findings_of
 from backlash_ros.core.loop.loop_statistics import Lately
 from backlash_ros.core.loop.sample_counter import SampleCounter, kept_outputs
-from backlash_ros.core.parameters import Parameters
 
 
 class Controller:

@@ -6,15 +6,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from cases.random_cases import random_plant
 
-from backlash_ros.core.assembly import (
-    build_controller,
-    build_model,
-    build_plant,
-    build_reference,
-    law_fits,
-)
+from backlash_ros.core import Parameters, build_controller, build_plant, build_reference
+from backlash_ros.core.assembly import build_model, law_fits
 from backlash_ros.core.loop.sample_counter import Output
-from backlash_ros.core.parameters import Parameters
 
 PERIOD_S = 0.01
 LAWS = ('moving_horizon',) * 4 + ('lms', 'printed', 'fixed', 'gradient')

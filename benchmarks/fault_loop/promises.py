@@ -8,7 +8,8 @@ from math import inf
 
 import numpy as np
 
-from backlash_ros.core.assembly import build_controller, build_model, build_plant, build_state_model
+from backlash_ros.core import Parameters, Status, build_controller, build_plant
+from backlash_ros.core.assembly import build_model, build_state_model
 from backlash_ros.core.control.controller import AdaptiveController, ControlStep
 from backlash_ros.core.control.limits import at_rest
 from backlash_ros.core.control.paper_structure import LARGEST_F_OVER_M
@@ -20,8 +21,6 @@ from backlash_ros.core.control.protocol import (
 from backlash_ros.core.control.tracking.design import Weights, feedback_around
 from backlash_ros.core.control.tracking.rest import TOLERANCE
 from backlash_ros.core.control.tracking.tracking import FADING
-from backlash_ros.core.estimate import Status
-from backlash_ros.core.parameters import Parameters
 
 ROUNDING = 1e-9
 TWICE = 2.0  # an interruption may ask for what the reference alone does not

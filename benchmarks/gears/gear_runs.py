@@ -16,14 +16,13 @@ sys.path.append(str(Path(__file__).resolve().parents[2] / 'examples'))
 
 from gear_physics import PRESETS, Gear, GearPhysics
 
-from backlash_ros.core.assembly import build_controller
+from backlash_ros.core import Parameters, Status, build_controller
 from backlash_ros.core.control.controller import AdaptiveController
-from backlash_ros.core.estimate import Status
 from backlash_ros.core.identification.actuator import with_actuator
 from backlash_ros.core.identification.identification import identify
 from backlash_ros.core.identification.motion import strokes
 from backlash_ros.core.identification.result import Identification, Options
-from backlash_ros.core.parameters import ParameterError, Parameters, Value
+from backlash_ros.core.parameters import ParameterError, Value
 from backlash_ros.tools.identify.identified_file import as_estimate, identified_parameters
 
 Motion = Callable[[float], float]  # of the phase [rad], between -1 and 1

@@ -13,8 +13,7 @@ from reporting import Check, Measured
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
-from backlash_ros.core.assembly import build_plant
-from backlash_ros.core.parameters import Parameters
+from backlash_ros.core import Parameters, build_plant
 
 COST_HEADER = ('rate', 'process', 'processor [%]', 'per sample [us]', '/ echo', 'memory [MB]')
 COST_RATES_HZ = (100.0, 200.0)

@@ -6,11 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from backlash_ros.core import Estimate, Parameters, Status, build_closed_loop
 from backlash_ros.core.assembly import LAWS, STRUCTURES, law_fits
-from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.estimates_file import was_given
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.simulation.closed_loop import build_closed_loop
 
 SAMPLES, RESTS_FROM = 1000, 500
 SEED = 5

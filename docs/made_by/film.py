@@ -17,8 +17,7 @@ from matplotlib.transforms import Affine2D
 from PIL import Image
 from reporting import ROOT, save_film
 
-from backlash_ros.core.assembly import build_controller
-from backlash_ros.core.estimate import Status
+from backlash_ros.core import Status, build_controller
 
 GEAR = replace(PRESETS['servo'], swing=0.04)  # [rad]
 PERIOD_S, SINE_S = GEAR.sample_period, 1.0 / GEAR.frequency  # errors are averaged over a sine

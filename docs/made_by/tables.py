@@ -12,11 +12,10 @@ import printed_law
 from reporting import ROOT
 from reporting import markdown_table as markdown
 
+from backlash_ros.core import Parameters, Status, build_closed_loop
 from backlash_ros.core.assembly import build_model, build_true_model
-from backlash_ros.core.estimate import Status
-from backlash_ros.core.parameters import BY_NAME, Parameter, Parameters, as_yaml
+from backlash_ros.core.parameters import BY_NAME, Parameter, as_yaml
 from backlash_ros.core.plant.transfer_function import TransferFunction
-from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.run_record import RunRecord, control_error_rms, settling_time
 from backlash_ros.tools.config import effective_parameters
 from backlash_ros.tools.runs.read_run import run_loop

@@ -5,12 +5,11 @@ from math import pi
 import numpy as np
 from scipy.signal import cont2discrete
 
-from backlash_ros.core.assembly import build_plant
+from backlash_ros.core import Parameters, build_plant
 from backlash_ros.core.control.limits import Limits
 from backlash_ros.core.driver_check.heard import Graph, Heard, Message
 from backlash_ros.core.driver_check.verdict import FLOAT64, WRONG, Judgement, judge
 from backlash_ros.core.identification.motion import Drive, waves
-from backlash_ros.core.parameters import Parameters
 
 PERIOD_S = 0.04  # long enough that a busy machine does not disturb it
 NATURAL = 2.0 * pi * 2.0  # rad/s

@@ -10,8 +10,7 @@ from ros_processes import NodeProcess, Probe, RosWorld, wait_until
 from std_msgs.msg import Float64, Float64MultiArray
 
 from backlash_ros import topics
-from backlash_ros.core.assembly import build_plant, build_reference
-from backlash_ros.core.parameters import Parameters
+from backlash_ros.core import Parameters, build_plant, build_reference
 
 NOISE = 1e-3
 # Long enough that other processes do not make every command late. A sample of the loop is that of

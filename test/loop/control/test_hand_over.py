@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from backlash_ros.core.assembly import build_controller, build_state_model, build_structure
+from backlash_ros.core import Parameters, build_closed_loop, build_controller
+from backlash_ros.core.assembly import build_state_model, build_structure
 from backlash_ros.core.control.controller import AdaptiveController
 from backlash_ros.core.control.tracking.design import Weights, design
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.simulation.closed_loop import build_closed_loop
 
 PARAMETERS = Parameters({
     'structure': 'tracking', 'amplitude': 1.0, 'estimator.law': 'fixed', 'fixed.doubt': 0.1,

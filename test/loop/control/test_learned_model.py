@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.signal import cont2discrete
 
+from backlash_ros.core import Estimate, Parameters, build_closed_loop
 from backlash_ros.core.assembly import build_model, build_true_model
 from backlash_ros.core.control.controller import AdaptiveController
 from backlash_ros.core.control.inverse import BacklashInverse
@@ -20,7 +21,6 @@ from backlash_ros.core.control.redesign import LONGEST_WAIT
 from backlash_ros.core.control.tracking.design import TrackingDesign, Weights, better_design, design
 from backlash_ros.core.control.tracking.margin import modulus_margin
 from backlash_ros.core.control.tracking.tracking import Tracking
-from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.law import Interval, Law, LawReport
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.loop.learned_model import (
@@ -29,10 +29,9 @@ from backlash_ros.core.loop.learned_model import (
     from_fields,
     learned_model_of,
 )
-from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.simulated_plant import SimulatedPlant
 from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
-from backlash_ros.core.simulation.closed_loop import ClosedLoop, build_closed_loop
+from backlash_ros.core.simulation.closed_loop import ClosedLoop
 
 MOTOR = Parameters({
     'sample_period': 0.005, 'plant.numerator': [0.1513, 0.1325],

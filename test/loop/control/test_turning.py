@@ -5,16 +5,15 @@ import pytest
 from numpy.typing import NDArray
 from scipy import signal
 
+from backlash_ros.core import Parameters, build_closed_loop
 from backlash_ros.core.assembly import build_model
 from backlash_ros.core.control.tracking.design import Weights, design
 from backlash_ros.core.control.tracking.feedback import TRUSTED_AFTER, StateFeedback, Trust
 from backlash_ros.core.control.tracking.tracking import Tracking
 from backlash_ros.core.control.tracking.trajectory import IdealTrajectory
-from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.backlash import Region
 from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
 from backlash_ros.core.reference.signal import ReferenceSignal
-from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.run_record import turns
 
 Array = NDArray[np.float64]

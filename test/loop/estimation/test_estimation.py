@@ -12,10 +12,8 @@ from contract.learning_rows import Job, Outcome, changes_jobs, run_job
 from ordinary_motions import all_cases, run_case
 from scipy.special import chdtri
 
+from backlash_ros.core import Parameters, Status, build_closed_loop
 from backlash_ros.core.control.controller import Limits
-from backlash_ros.core.estimate import Status
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.simulation.closed_loop import build_closed_loop
 
 PAPER = (np.array([1e-5, 4e-5, 1e-5]), np.array([1.0, -2.88504, 2.77196, -0.88692]))
 SEEDS = range(300, 306)

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 from places import ROOT
 
-from backlash_ros.core.estimate import Status
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.simulation.closed_loop import build_closed_loop
+from backlash_ros.core import Parameters, Status, build_closed_loop
 from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.tools.config import read_configuration
 

@@ -9,10 +9,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from backlash_ros.core.assembly import build_controller
-from backlash_ros.core.estimate import Estimate, Status
+from backlash_ros.core import Estimate, Parameters, Status, build_controller
 from backlash_ros.core.law import Interval, Law
-from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.backlash import clamp
 
 # Second order, 20 Hz, at 200 Hz, as in geared_motor.yaml.

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from strategies import output_of, paper_example
 
-from backlash_ros.core.parameters import Parameters
+from backlash_ros.core import Parameters, build_closed_loop
 from backlash_ros.core.plant.transfer_function import TransferFunction
-from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.run_record import control_error_rms, settling_time
 
 

@@ -10,11 +10,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from undrawn import leave_out
 
 from backlash_ros import topics
-from backlash_ros.core.assembly import build_plant, build_reference
+from backlash_ros.core import Parameters, build_closed_loop, build_plant, build_reference
 from backlash_ros.core.loop.control_loop import ControlLoop, Driver
 from backlash_ros.core.loop.sample_counter import Output, SampleCounter
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.simulation.closed_loop import build_closed_loop, parting, replay
+from backlash_ros.core.simulation.closed_loop import parting, replay
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord, row_of
 from backlash_ros.tools import simulate as simulate
 from backlash_ros.tools.config import write_config

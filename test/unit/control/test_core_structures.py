@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from scipy import signal
 from strategies import NO_STATE, PAPER_DENOMINATOR, PAPER_NUMERATOR, Play, plants, usual_plays
 
+from backlash_ros.core import Estimate, Parameters, build_closed_loop
 from backlash_ros.core.assembly import build_four_blocks, build_structure
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.paper_structure import LARGEST_F_OVER_M, Proportional
@@ -17,11 +18,9 @@ from backlash_ros.core.control.protocol import Command, ControlInput
 from backlash_ros.core.control.tracking.design import power_gain
 from backlash_ros.core.control.tracking.lq_preview import PreviewGains, preview_gains
 from backlash_ros.core.control.tracking.reference_window import ReferenceWindow, averages
-from backlash_ros.core.estimate import Estimate
-from backlash_ros.core.parameters import ParameterError, Parameters
+from backlash_ros.core.parameters import ParameterError
 from backlash_ros.core.plant.numerics import place_poles
 from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
-from backlash_ros.core.simulation.closed_loop import build_closed_loop
 
 LARGEST_SHARE = 0.8  # of m that f may have
 

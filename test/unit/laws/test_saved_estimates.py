@@ -9,13 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from backlash_ros.core.assembly import build_controller
-from backlash_ros.core.estimate import Estimate, Status
+from backlash_ros.core import Estimate, Parameters, Status, build_closed_loop, build_controller
 from backlash_ros.core.estimates_file import load_estimate, save_estimate, worth_saving
 from backlash_ros.core.loop.control_loop import ControlLoop, Driver
 from backlash_ros.core.loop.sample_counter import SampleCounter
-from backlash_ros.core.parameters import ParameterError, Parameters
-from backlash_ros.core.simulation.closed_loop import build_closed_loop, replay
+from backlash_ros.core.parameters import ParameterError
+from backlash_ros.core.simulation.closed_loop import replay
 from backlash_ros.tools.runs.summary import summarise
 
 LEARNED = Estimate(1.25, 2.5, -3.5, 0.2, 0.01, 0.02, 0.03, Status.TRACKING)

@@ -21,8 +21,7 @@ from made_bags import (
 from matplotlib.figure import Figure
 from rosbags.rosbag2 import StoragePlugin
 
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.simulation.closed_loop import build_closed_loop
+from backlash_ros.core import Parameters, build_closed_loop
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 from backlash_ros.tools import figures
 from backlash_ros.tools import replay as replay

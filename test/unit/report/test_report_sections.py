@@ -8,8 +8,7 @@ import pytest
 from made_bags import MULTI_ARRAY, PARAMETERS, rows_of, write_messages
 
 from backlash_ros import topics
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.simulation.closed_loop import build_closed_loop
+from backlash_ros.core import Parameters, build_closed_loop
 from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.tools import report as report
 from backlash_ros.tools.cli import Span

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from places import ROOT
 
-from backlash_ros.core.assembly import build_controller
+from backlash_ros.core import Parameters, build_closed_loop, build_controller
 from backlash_ros.core.estimates_file import load_estimate
-from backlash_ros.core.parameters import ParameterError, Parameters
-from backlash_ros.core.simulation.closed_loop import build_closed_loop
+from backlash_ros.core.parameters import ParameterError
 from backlash_ros.tools.cli import InputError
 from backlash_ros.tools.config import (
     Setting,

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from backlash_ros.atomic_file import write_atomically
+from backlash_ros.core import Parameters, build_closed_loop
 from backlash_ros.core.loop.learned_model import LearnedModel
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.run_record import (
     COLUMNS,
     RunRecord,
