@@ -9,12 +9,7 @@ from enum import Enum
 from math import isfinite, nan
 from typing import NamedTuple
 
-from backlash_ros.core.assembly import (
-    build_controller,
-    build_limits,
-    build_structure,
-    first_guess,
-)
+from backlash_ros.core.assembly import build_controller, build_limits, build_structure, first_guess
 from backlash_ros.core.control.controller import LONGEST_GAP, ControlStep
 from backlash_ros.core.control.limits import Motion, at_rest, last_commands, plausible
 from backlash_ros.core.estimate import Estimate, Status
@@ -26,7 +21,7 @@ from backlash_ros.core.parameters import NOISE, Parameters
 
 
 class Phase(Enum):
-    """Where a loop stands."""
+    """Whether a loop commands, and with what it begins."""
 
     BEGINS = 'begins'
     RUNS = 'runs'
@@ -35,33 +30,23 @@ class Phase(Enum):
 
 
 class Event(Enum):
-    """What happens to a loop."""
+    """What happens to a loop: the phases in which it changes anything, and the one that follows."""
 
-    ANSWER = 'answer'  # y and y_m are there, and which v acts, or nobody is going to say it
-    # An output after a silence, a restart of the driver, or more lost samples than can be stepped
-    # over; while the loop runs, a reset of the estimates or an activation as well.
-    INTERRUPTION = 'interruption'
-    TIMEOUT = 'timeout'  # no output for timeout.plant_output
-    RIVAL = 'rival'  # another controller was first
-    RIVAL_GONE = 'rival gone'
+    # y and y_m are there, and which v acts, or nobody is going to say it.
+    ANSWER = (Phase.BEGINS,), Phase.RUNS
+    # An output after a silence, a restart of the driver, more lost samples than can be stepped
+    # over; while the loop runs, a reset or an activation: the state of the plant is unknown.
+    INTERRUPTION = (Phase.RUNS, Phase.SILENT), Phase.BEGINS
+    # No output for timeout.plant_output: the commands of on_timeout follow.
+    TIMEOUT = (Phase.BEGINS, Phase.RUNS), Phase.SILENT
+    # Another controller was first, nodes/control/rivals.py says; its commands tell which v acts.
+    RIVAL = (Phase.BEGINS, Phase.RUNS, Phase.SILENT), Phase.STANDS_DOWN
+    RIVAL_GONE = (Phase.STANDS_DOWN,), Phase.BEGINS
 
-
-NEXT: dict[tuple[Phase, Event], Phase] = {
-    (Phase.BEGINS, Event.ANSWER): Phase.RUNS,  # from the v that acts
-    (Phase.BEGINS, Event.TIMEOUT): Phase.SILENT,  # with the commands of on_timeout
-    (Phase.BEGINS, Event.RIVAL): Phase.STANDS_DOWN,  # the commands of the rival tell which v acts
-    (Phase.RUNS, Event.INTERRUPTION): Phase.BEGINS,  # the state of the plant is unknown
-    (Phase.RUNS, Event.TIMEOUT): Phase.SILENT,
-    (Phase.RUNS, Event.RIVAL): Phase.STANDS_DOWN,
-    (Phase.SILENT, Event.INTERRUPTION): Phase.BEGINS,  # the driver is back
-    (Phase.SILENT, Event.RIVAL): Phase.STANDS_DOWN,
-    (Phase.STANDS_DOWN, Event.RIVAL_GONE): Phase.BEGINS,  # from the newest v that was heard
-}
-
-
-def after(phase: Phase, event: Event) -> Phase:
-    """The phase that follows."""
-    return NEXT.get((phase, event), phase)
+    def after(self, phase: Phase) -> Phase:
+        """The phase that follows on this one."""
+        phases, following = self.value
+        return following if phase in phases else phase
 
 
 class Driver(NamedTuple):
@@ -118,18 +103,7 @@ class ControlLoop:
         self._ending: Iterator[float] = iter(())  # commands that lead v to its end
 
     @property
-    def estimate(self) -> Estimate:
-        """What is known of the backlash."""
-        return self.core.estimator.estimate
-
-    @property
-    def v(self) -> float:
-        """The newest command that acts, whoever has sent it."""
-        return self.core.motion.v
-
-    @property
     def statistics(self) -> LoopStatistics:
-        """What was counted."""
         return self.commands.counts
 
     @property
@@ -137,6 +111,15 @@ class ControlLoop:
         """All counts by name, also of what LoopFigures has besides."""
         wraps, dead = self.statistics.wraps, self.executor.restarts
         return {**self.statistics.by_name(), 'wraps': wraps, 'dead_workers': dead}
+
+    @property
+    def estimate(self) -> Estimate:
+        return self.core.estimator.estimate
+
+    @property
+    def v(self) -> float:
+        """The newest command that acts, whoever has sent it."""
+        return self.core.motion.v
 
     @property
     def unreferred_s(self) -> float:
@@ -150,7 +133,6 @@ class ControlLoop:
 
     @property
     def silent(self) -> bool:
-        """Whether the driver is."""
         return self.phase is Phase.SILENT
 
     @property
@@ -179,13 +161,10 @@ class ControlLoop:
     ) -> ControlStep | None:
         """Count y(k), learn from it, and send v(k); None where the message brings no command.
 
-        arrival: of an output that was counted already. y_m: that of this sample, None for the
-        newest one.
+        arrival: of an output that was counted already. y_m: None for the newest one.
         """
-        if arrival is None:
-            arrival = self.counter.count(*output.counted)
-        if y_m is None:
-            y_m = self.heard.y_m
+        arrival = arrival or self.counter.count(*output.counted)
+        y_m = self.heard.y_m if y_m is None else y_m
         if not self._is_usable(output, arrival, y_m):
             return None
         step = self._step_core(output.y, y_m, output.stamp_ns)
@@ -232,11 +211,9 @@ class ControlLoop:
         return False
 
     def _note_missing(self, arrival: Arrival, lost: bool = True) -> None:
-        gap = self._gap
-        self._gap = Arrival(
-            True, gap.missing + arrival.missing, gap.restarted or arrival.restarted,
-            gap.unsent + arrival.unsent,
-        )
+        _, missing, restarted, unsent = self._gap
+        self._gap = Arrival(True, missing + arrival.missing, restarted or arrival.restarted,
+                            unsent + arrival.unsent)
         # What came before the first sample that is used was not lost: nobody listened.
         if lost and self.phase is Phase.RUNS and not arrival.restarted:
             self.statistics.lost += arrival.missing
@@ -244,11 +221,11 @@ class ControlLoop:
 
     def _may_answer(self, output: Output) -> bool:
         """Begin anew where too much is missing; returns whether a v to go on from is known."""
-        p, gap, silent = self._p, self._gap, self.phase is Phase.SILENT
+        p, gap = self._p, self._gap
         stalled = not p.lockstep \
             and 0.0 < p.timeout.plant_output < gap.missing * p.sample_period
         too_long = self.phase is Phase.RUNS and (gap.missing > LONGEST_GAP or stalled)
-        if silent or gap.restarted or too_long:
+        if self.silent or gap.restarted or too_long:
             self.statistics.interruptions += 1
             self._happens(Event.INTERRUPTION)
             self.commands.origin.restart()
@@ -259,10 +236,8 @@ class ControlLoop:
         """Whether it is known from which v the first command goes on, or waiting is in vain."""
         p, driver = self._p, self._driver
         if missing := p.missing_limits:
-            driver.warn(
-                f'{", ".join(missing)}: not set, so nothing keeps v within what the actuator '
-                'bears: set them'
-            )
+            driver.warn(f'{", ".join(missing)}: not set, so nothing keeps v within what the '
+                        'actuator bears: set them')
         reported = self.commands.newest_report(output.stamp_ns)
         if isfinite(reported):
             self._go_on_from(self.core.command_of(reported))
@@ -276,10 +251,8 @@ class ControlLoop:
             # v and y are the same angle but for the gap: the joint holds where it stands.
             self._go_on_from(output.y / self.estimate.m)
         else:
-            driver.warn(
-                'nobody says which v acts now, so the first command goes on from 0: publish '
-                f'{driver.applied}, or set control.initial'
-            )
+            driver.warn('nobody says which v acts now, so the first command goes on from 0: '
+                        f'publish {driver.applied}, or set control.initial')
         return True
 
     def _step_core(self, y: float, y_m: float, stamp_ns: int) -> ControlStep:
@@ -296,21 +269,17 @@ class ControlLoop:
         # Late commands are counted even where the driver says which ones it applied.
         acted, others = commands.over(lost + 1, stamp_ns, self.counter.due_ns)
         reports = commands.reported_over(lost + 1, stamp_ns, unsent)
-        if reports and self._has_other_origin(reports[-1], acted[-1]):
+        origin = commands.origin
+        if reports and origin.changed_by(
+            reports[-1] + origin.value, acted[-1] / core.command_of(1.0), self.estimate
+        ):
+            self._driver.warn(f'{self._driver.applied} is {origin.value:.4g} beyond v: taken for '
+                              'another zero of the motor encoder, and subtracted')
+            self.renew(origin.before)
             return self._step_core(y, y_m, stamp_ns)
         return core.step(y, y_m, lost, reports, others, acted)
 
-    def _has_other_origin(self, report: float, command: float) -> bool:
-        """Begin anew where reports turn out to have another origin than what was learned from."""
-        origin, scale = self.commands.origin, self.core.command_of(1.0)
-        if not origin.changed_by(report + origin.value, command / scale, self.estimate):
-            return False
-        self._driver.warn(
-            f'{self._driver.applied} is {origin.value:.4g} beyond v: taken for another zero of the '
-            'motor encoder, and subtracted'
-        )
-        self.renew(origin.before)
-        return True
+    # --- whatever else happens -------------------------------------------------------------------
 
     @property
     def is_overdue(self) -> bool:
@@ -360,10 +329,7 @@ class ControlLoop:
         return v is not None
 
     def renew(self, estimate: Estimate | None) -> None:
-        """Go on from the present v with a new core that begins with these estimates, if any.
-
-        Nothing is known of the state of the plant then.
-        """
+        """Go on from the present v with a new core that begins with these estimates, if any."""
         if self.phase is Phase.RUNS:
             self._happens(Event.INTERRUPTION)
         self._renew_core(estimate)
@@ -372,8 +338,30 @@ class ControlLoop:
         """Begin with the estimates of estimator.initial."""
         self.renew(first_guess(self._p))
 
+    def adapt(self, adapting: bool) -> None:
+        """Learn, or hold the estimates."""
+        self.core.estimator.adapting = adapting
+
+    def compensate(self, compensating: bool) -> None:
+        """Cancel the gap, or invert the slope alone."""
+        self.core.compensating = compensating
+
+    def take_up(self, p: Parameters) -> None:
+        """Use other values of the live parameters; what was learned stays."""
+        before, self._p, core = self._p, p, self.core
+        core.limits = build_limits(p)
+        core.inverse.direction_band = p.inverse.direction_band
+        core.inverse.take_up = p.inverse.take_up_rate * p.sample_period
+        core.estimator.retune(p)
+        if any(p[name] != before[name] for name in (
+            'tracking.input_weight', 'tracking.integral_weight', 'inverse.caution', NOISE,
+        )):
+            structure = build_structure(p)
+            structure.go_on_from(core.structure)
+            core.structure = structure
+
     def _happens(self, event: Event) -> None:
-        self.phase = after(self.phase, event)
+        self.phase = event.after(self.phase)
 
     def _renew_core(self, estimate: Estimate | None) -> None:
         before = self.core
@@ -389,26 +377,3 @@ class ControlLoop:
         if v != self.v:
             self.core.motion = at_rest(v)
         self.knows_v = True
-
-    def adapt(self, adapting: bool) -> None:
-        """Learn, or hold the estimates."""
-        self.core.estimator.adapting = adapting
-
-    def compensate(self, compensating: bool) -> None:
-        """Cancel the gap, or invert the slope alone."""
-        self.core.compensating = compensating
-
-    def take_up(self, p: Parameters) -> None:
-        """Use other values of the live parameters; what was learned stays."""
-        before, self._p = self._p, p
-        core = self.core
-        core.limits = build_limits(p)
-        core.inverse.direction_band = p.inverse.direction_band
-        core.inverse.take_up = p.inverse.take_up_rate * p.sample_period
-        core.estimator.retune(p)
-        if any(p[name] != before[name] for name in (
-            'tracking.input_weight', 'tracking.integral_weight', 'inverse.caution', NOISE,
-        )):
-            structure = build_structure(p)
-            structure.go_on_from(core.structure)
-            core.structure = structure

@@ -10,7 +10,7 @@ from math import isfinite
 from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.jobs import Executor
-from backlash_ros.core.loop.control_loop import ControlLoop, Driver, Phase
+from backlash_ros.core.loop.control_loop import ControlLoop, Driver
 from backlash_ros.core.loop.sample_counter import Output, SampleCounter
 from backlash_ros.core.parameters import Parameters
 
@@ -51,7 +51,7 @@ class JointLoops:
         """
         arrival = self.counter.count(*next(iter(outputs.values())).counted)
         if self._together and any(
-            loop.phase is Phase.SILENT and not (joint in outputs and isfinite(outputs[joint].y))
+            loop.silent and not (joint in outputs and isfinite(outputs[joint].y))
             for joint, loop in self.by_name.items()
         ):
             outputs = {}  # an arm of which one joint is still lost does not begin

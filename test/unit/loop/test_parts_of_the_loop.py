@@ -7,7 +7,7 @@ from math import isnan
 import numpy as np
 import pytest
 
-from backlash_ros.core.loop.control_loop import Event, Phase, after
+from backlash_ros.core.loop.control_loop import Event, Phase
 from backlash_ros.core.loop.diagnosis import AGAIN_S, LASTS_S, Finding, Level, LevelLog
 from backlash_ros.core.loop.loop_statistics import Lately, LoopStatistics
 from backlash_ros.core.loop.sample_counter import DriverPeriod
@@ -16,7 +16,7 @@ from backlash_ros.core.parameters import ParameterError, Parameters
 
 @pytest.mark.parametrize(('phase', 'event'), list(product(Phase, Event)))
 def test_a_loop_that_stands_down_is_woken_by_nothing_but_the_end_of_its_rival(phase, event):
-    following = after(phase, event)
+    following = event.after(phase)
     if phase is Phase.STANDS_DOWN:
         assert (following is phase) == (event is not Event.RIVAL_GONE)
     if event is Event.RIVAL:
