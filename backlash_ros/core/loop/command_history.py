@@ -13,85 +13,9 @@ from backlash_ros.core.loop.loop_statistics import LoopStatistics
 from backlash_ros.core.parameters import Parameters
 
 Array = NDArray[np.float64]
-
-LOOKS = 10  # that tell the origin, after which it counts as settled
-
-
-class ReportOrigin:
-    """Finds the constant between the v that is reported and the command that it stands for.
-
-    The motor follows its command v with a first-order lag, p = 0 where it takes it over at once:
-
-        r(k) - b = p (r(k-1) - b) + (1 - p) v(k)
-
-    which is a straight line of r(k) - v(k) over r(k-1) - v(k). A motor that rests, or does not
-    follow because it is saturated, has p = 1 and tells nothing. What is left of the line has to be
-    small beside b: a driver that limits v to one side has no other origin.
-
-    value: b, 0 until another one is certain. before: what was known at the first report.
-    """
-
-    def __init__(self) -> None:
-        self.value = 0.0
-        self.before: Estimate | None = None
-        self.restart()
-
-    def restart(self) -> None:
-        """Look again: the driver was restarted, and its encoder perhaps zeroed."""
-        self._looks = 0
-        self._pairs: deque[tuple[float, float]] = deque(maxlen=201)
-        self._new = 0  # pairs since the last look
-
-    def changed_by(
-        self, report: float, command: float, known: Estimate | None = None,
-    ) -> bool:
-        """Take in what was reported of an interval and commanded in it; whether `value` changed.
-
-        known: at present. What was learned beside another origin is void.
-        """
-        look_after, correlated, significant = 20, 10.0, 5.0  # intervals, intervals, deviations
-        if not self._pairs:
-            self.before = known
-        if self._looks == LOOKS:
-            return False
-        self._pairs.append((report, command))
-        self._new += 1
-        if self._new <= look_after:
-            return False
-        self._new = 0
-        r, v = np.array(self._pairs).T
-        y, x = r[1:] - v[1:], r[:-1] - v[1:]
-        y_mean, x_mean = float(y.mean()), float(x.mean())
-        spread = float(((x - x_mean) ** 2).sum())
-        rounding = 1e-9 * float(np.abs(self._pairs).max())
-        if spread <= len(x) * rounding**2:
-            return False
-        p = float((x - x_mean) @ (y - y_mean)) / spread
-        rest = float(np.mean((y - y_mean - p * (x - x_mean)) ** 2))
-        p_std = sqrt(correlated * rest / spread)
-        if not 1.0 - p > significant * p_std + 1e-6:
-            return False
-        self._looks += 1
-        found = (y_mean - p * x_mean) / (1.0 - p)
-        off = abs(found - self.value)
-        std = sqrt(correlated * rest / len(x) + (p_std * (x_mean - found)) ** 2) / (1.0 - p)
-        if off <= significant * max(std, sqrt(rest)) + rounding:
-            return False
-        self.value, self._looks = found, LOOKS
-        return True
-
-
-def without_origin(reports: Array, commands: Array) -> Array:
-    """Reports of a record as they would be from an encoder that was zeroed; nan where none is."""
-    origin = ReportOrigin()
-    for report, command in zip(reports.tolist(), commands.tolist(), strict=True):
-        if report == report and command == command:
-            origin.changed_by(report, command)
-    return reports - origin.value
-
-
 Stamps = NDArray[np.int64]  # [ns], of one clock
 
+LOOKS = 10  # that tell the origin of reports, after which it counts as settled
 REPORTED = 0.9  # share of the samples that reports have to tell of to be believed
 # Outputs in a row with a report for each of their intervals after which reports are believed, and
 # without, after which they are given up. Messages that have nothing to do with the samples fit an
@@ -125,29 +49,92 @@ class ReportTrust:
 
     def note(self, complete: bool) -> bool:
         """Note whether each interval before an output had its report; returns `trusted`."""
-        if not self._auto:
-            return self.trusted
-        if self._first < CONSISTENT:
+        if self._auto and self._first < CONSISTENT:
             self._first = self._first + 1 if complete else CONSISTENT if self.trusted else 0
             self.trusted = complete
-            return complete
-        self._contrary = 0 if complete is self.trusted else self._contrary + 1
-        if self._contrary == CONSISTENT:
-            self.trusted, self._contrary = complete, 0
+        elif self._auto:
+            self._contrary = 0 if complete is self.trusted else self._contrary + 1
+            if self._contrary == CONSISTENT:
+                self.trusted, self._contrary = complete, 0
         return self.trusted
 
 
+class ReportOrigin:
+    """Finds where reports have their zero: a motor encoder may not have been zeroed.
+
+    The motor follows its command v with a first-order lag, r(k) - b = p (r(k-1) - b) + (1 - p)
+    v(k): a straight line of r(k) - v(k) over r(k-1) - v(k). A motor that rests, or is saturated,
+    has p = 1 and tells nothing. What is left of the line has to be small beside b: a driver that
+    limits v to one side has no other origin.
+
+    value: b, 0 until another one is certain. before: what was known at the first report.
+    """
+
+    def __init__(self) -> None:
+        self.value = 0.0
+        self.before: Estimate | None = None
+        self.restart()
+
+    def restart(self) -> None:
+        """Look again: the driver was restarted, and its encoder perhaps zeroed."""
+        self._looks = self._new = 0  # _new: pairs since the last look
+        self._pairs: deque[tuple[float, float]] = deque(maxlen=201)
+
+    def changed_by(self, report: float, command: float, known: Estimate | None = None) -> bool:
+        """Take in what was reported of an interval and commanded in it; whether `value` changed.
+
+        known: at present. What was learned beside another origin is void.
+        """
+        look_after, correlated, significant = 20, 10.0, 5.0  # intervals, intervals, deviations
+        if not self._pairs:
+            self.before = known
+        if self._looks == LOOKS:
+            return False
+        self._pairs.append((report, command))
+        self._new += 1
+        if self._new <= look_after:
+            return False
+        self._new = 0
+        r, v = np.array(self._pairs).T
+        y, x = r[1:] - v[1:], r[:-1] - v[1:]
+        y_mean, x_mean = float(y.mean()), float(x.mean())
+        spread = float(((x - x_mean) ** 2).sum())
+        rounding = 1e-9 * float(np.abs(self._pairs).max())
+        if spread <= len(x) * rounding**2:
+            return False
+        p = float((x - x_mean) @ (y - y_mean)) / spread
+        rest = float(np.mean((y - y_mean - p * (x - x_mean)) ** 2))
+        p_std = sqrt(correlated * rest / spread)
+        if not 1.0 - p > significant * p_std + 1e-6:
+            return False
+        self._looks += 1
+        found = (y_mean - p * x_mean) / (1.0 - p)
+        std = sqrt(correlated * rest / len(x) + (p_std * (x_mean - found)) ** 2) / (1.0 - p)
+        if abs(found - self.value) <= significant * max(std, sqrt(rest)) + rounding:
+            return False
+        self.value, self._looks = found, LOOKS
+        return True
+
+
+def without_origin(reports: Array, commands: Array) -> Array:
+    """Reports of a record as they would be from an encoder that was zeroed; nan where none is."""
+    origin = ReportOrigin()
+    for report, command in zip(reports.tolist(), commands.tolist(), strict=True):
+        if report == report and command == command:
+            origin.changed_by(report, command)
+    return reports - origin.value
+
+
 class CommandHistory:
-    """Published commands by time, and applied ones where the driver reports them.
+    """Published commands by time [ns], and applied ones where the driver reports them.
 
     The driver applies over an interval the newest v it has when the interval ends with the next
     sample. So a v that cannot have been there when that sample was taken came too late, and the one
-    before it was in use: v is as long under way as y is. Times are those of one clock [ns].
+    before it was in use: v is as long under way as y is.
 
     counts: where late commands and missing reports are counted. trust: whether reports go before
     own commands. origin: of reports, which is subtracted. newest_ns: when the newest command left,
-    own or of another controller. output_ns: stamp of the newest output that was used; reports up to
-    the first one belong to nothing.
+    own or of another controller. output_ns: stamp of the newest output that was used.
     """
 
     def __init__(
@@ -198,10 +185,9 @@ class CommandHistory:
         It tells where the commands begin, even where it is not to be learned from. A command that
         left in that interval outdates it.
         """
-        if self._reported and end_ns > self.newest_ns + self._period_ns:
-            stamp_ns, v = self._reported[-1]
-            if stamp_ns > end_ns - 1.5 * self._period_ns:
-                return v - self.origin.value
+        if self._reported and end_ns > self.newest_ns + self._period_ns \
+                and self._reported[-1][0] > end_ns - 1.5 * self._period_ns:
+            return self._reported[-1][1] - self.origin.value
         return nan
 
     def reported_over(self, intervals: int, end_ns: int, unsent: int = 0) -> list[float]:
@@ -216,7 +202,7 @@ class CommandHistory:
         while self._reported and self._reported[0][0] <= end_ns:
             stamp_ns, v = self._reported.popleft()
             if stamp_ns > begin_ns:
-                reports.append(v)
+                reports.append(v - self.origin.value)
         if reports and len(reports) == intervals - unsent:
             reports += reports[-1:] * unsent
         # The report of the newest interval may still be under way while older ones are here.
@@ -224,7 +210,7 @@ class CommandHistory:
         if not self.trust.note(complete):
             return []
         self.counts.unreported += not complete
-        return [v - self.origin.value for v in reports] if complete else []
+        return reports if complete else []
 
     def _at(self, time_ns: float) -> tuple[float, float]:
         """The newest v that had left by then, and the one beside it that may have been in use."""

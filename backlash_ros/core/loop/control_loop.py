@@ -108,9 +108,8 @@ class ControlLoop:
 
     @property
     def counted(self) -> dict[str, int]:
-        """All counts by name, also of what LoopFigures has besides."""
-        wraps, dead = self.statistics.wraps, self.executor.restarts
-        return {**self.statistics.by_name(), 'wraps': wraps, 'dead_workers': dead}
+        """All counts by name."""
+        return self.statistics.by_name() | {'dead_workers': self.executor.restarts}
 
     @property
     def estimate(self) -> Estimate:

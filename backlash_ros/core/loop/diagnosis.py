@@ -1,8 +1,8 @@
-"""Why the loop is not well: one table of conditions over what the controller has counted."""
+"""Why the loop is not well: one table of conditions over what was counted, and their log."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from math import inf, isfinite, nan
@@ -22,6 +22,19 @@ if TYPE_CHECKING:
 # once a second, be it a little early.
 LASTS_S = 1.5
 AGAIN_S = 10.0  # until the same cause is told once more
+LONGEST_TEXT = 99  # `ros2 topic echo` cuts off at 128, and a terminal line holds more besides
+# Share of late, lost or bad samples from which on the loop is told to suffer from them.
+TROUBLE = 0.01
+UNNAMED = 'a node without a name'
+SKEW = 0.5  # of a period: time from stamp to arrival that only a wrong clock or a slow way explains
+LATE_KINDS = ('late', 'lost', 'unsent')
+# Kinds of findings that pass by themselves as a rule.
+PASSING_KINDS = (*LATE_KINDS, 'waiting for output', 'waiting for reference', 'unheard', 'clock')
+# Kinds of findings about the messages, which are the same for all joints of a controller.
+OF_MESSAGES = frozenset((
+    'control type', 'control qos', 'rivals', 'second driver', 'second reference', 'unheard', 'rate',
+    'stamps', 'clock', 'late', 'unsent', 'lost', 'unreported', 'reference silent', 'worker',
+))
 
 
 class Level(IntEnum):
@@ -71,23 +84,6 @@ class LevelLog:
                 and now_s >= self._told_at.get(key, -inf) + AGAIN_S:
             self._told, self._told_at[key] = key, now_s
             self._write(finding.level, finding.text)
-
-
-LONGEST_TEXT = 99  # `ros2 topic echo` cuts off at 128, and a terminal line holds more besides
-# Share of late, lost or bad samples from which on the loop is told to suffer from them.
-TROUBLE = 0.01
-UNNAMED = 'a node without a name'
-SKEW = 0.5  # of a period: time from stamp to arrival that only a wrong clock or a slow way explains
-LATE_KINDS = ('late', 'lost', 'unsent')
-# Kinds of findings that pass by themselves as a rule.
-PASSING_KINDS = frozenset((
-    *LATE_KINDS, 'waiting for output', 'waiting for reference', 'unheard', 'clock',
-))
-# Kinds of findings about the messages, which are the same for all joints of a controller.
-OF_MESSAGES = frozenset((
-    'control type', 'control qos', 'rivals', 'second driver', 'second reference', 'unheard', 'rate',
-    'stamps', 'clock', 'late', 'unsent', 'lost', 'unreported', 'reference silent', 'worker',
-))
 
 
 def short(name: str) -> str:
@@ -162,9 +158,8 @@ class LoopFigures(Counts):
     """What the controller knows of the last few seconds; the counts are those gained in them.
 
     silent_s: timeout that has passed without y, 0 if it has not; reference_silent_s: likewise, inf
-    before the first y_m. wraps, dead_workers: counts as well. still: newest values of y in a row
-    that are equal within its noise. v_swing: how far v has moved meanwhile, and gap, nan while it
-    is not learned [unit of v].
+    before the first y_m. still: newest values of y in a row that are equal within its noise.
+    v_swing: how far v has moved meanwhile, and gap, nan while it is not learned [unit of v].
     """
 
     timing: Timing
@@ -174,8 +169,6 @@ class LoopFigures(Counts):
     silent_s: float = 0.0
     on_timeout: str = 'hold'
     reference_silent_s: float = 0.0
-    wraps: int = 0
-    dead_workers: int = 0
     still: int = 0
     v_swing: float = 0.0
     gap: float = nan
@@ -185,23 +178,16 @@ class LoopFigures(Counts):
         """Samples that have come, whatever they were worth."""
         return self.used + self.without_reference + self.bad_outputs
 
-    @property
-    def stands_still(self) -> bool:
-        """Whether y does though v moves on: in samples where the gap is known, else in time."""
-        if isfinite(self.gap):
-            return self.still >= 20 and self.v_swing > self.gap
-        return self.still * self.timing.nominal_s >= 5.0 and self.v_swing > 0.0
-
 
 def figures_of_loop(
     loop: ControlLoop, p: Parameters, timing: Timing, gained: Mapping[str, int],
     around: Neighbours,
 ) -> LoopFigures:
-    """What is known of a loop. gained: counts lately, and of workers that died."""
+    """What is known of a loop. gained: counts lately."""
     statistics, estimate, law = loop.statistics, loop.estimate, loop.core.estimator
-    timeout = p.timeout.reference
     # Hardware on topics falls silent where all joints are where they belong.
     may_be_silent = p.lockstep or p.io.style == 'joint_state_topic'
+    unreferred = not may_be_silent and 0.0 < p.timeout.reference < loop.unreferred_s
     return LoopFigures(
         **cast(Mapping[str, Any], gained), around=around,
         # In lockstep the outputs come as fast as the machine goes.
@@ -210,11 +196,9 @@ def figures_of_loop(
             estimate.status if statistics.used else None, law.report,
             statistics.inconsistent * p.sample_period, law.adapting, was_given(estimate),
         ),
-        standing_down=loop.standing_down,
+        standing_down=loop.standing_down, on_timeout=p.on_timeout,
         silent_s=p.timeout.plant_output if loop.silent else 0.0,
-        on_timeout=p.on_timeout,
-        reference_silent_s=inf if not isfinite(loop.heard.y_m)
-        else timeout if not may_be_silent and 0.0 < timeout < loop.unreferred_s else 0.0,
+        reference_silent_s=inf if not isfinite(loop.heard.y_m) else p.timeout.reference * unreferred,
         still=statistics.still, v_swing=statistics.still_swing,
         gap=estimate.c_r - estimate.c_l if estimate.learned else nan,
     )
@@ -229,7 +213,7 @@ def findings_of(f: LoopFigures) -> list[Finding]:
     The model is blamed only where nothing else explains why y does not follow from v: an estimate
     that is held for a while because samples are late or lost is a warning about these.
     """
-    causes = [_finding(row) for row in causes_of(f) if row[2]]
+    causes = _findings(causes_of(f))
     state, law = state_beside({cause.kind for cause in causes}, f), f.learning.report
     if state.kind == 'model':
         # What the fit has found out itself says more than what is late or missing; a wrong sign
@@ -239,22 +223,23 @@ def findings_of(f: LoopFigures) -> list[Finding]:
             lesser += ['unreported']
         if law.wrong_sign:
             lesser += ['rate', 'stamps', 'clock', 'reference silent', 'limited']
-        late = [cause for cause in causes if cause.kind in lesser]
-        return [cause for cause in causes if cause not in late] + [state, *late]
+        first = [cause for cause in causes if cause.kind not in lesser]
+        return [*first, state, *(cause for cause in causes if cause.kind in lesser)]
     return [*causes, state] if state.level != Level.OK or not causes else causes
 
 
 def state_beside(causes: set[str], f: LoopFigures) -> Finding:
     """How the learning goes where causes of these kinds were found."""
-    return next(_finding(row) for row in _states_beside(causes, f) if row[2])
+    return _findings(_states_beside(causes, f))[0]
 
 
-def _finding(row: Row) -> Finding:
-    kind, level, _, text = row
+def _findings(rows: Iterable[Row]) -> list[Finding]:
     # Most nodes get their name soon after they are found.
-    lasting = kind in PASSING_KINDS or UNNAMED in text
-    text = text if len(text) <= LONGEST_TEXT else text[:LONGEST_TEXT - 1] + '…'
-    return Finding(level, kind, text, lasting)
+    return [
+        Finding(level, kind, text if len(text) <= LONGEST_TEXT else text[:LONGEST_TEXT - 1] + '…',
+                kind in PASSING_KINDS or UNNAMED in text)
+        for kind, level, holds, text in rows if holds
+    ]
 
 
 def _is_unexplained(law: LawReport) -> bool:
@@ -266,23 +251,22 @@ def _percent(count: int, of: int) -> str:
     return f'{100.0 * count / max(of, 1):.3g} %'
 
 
-def _unheard(around: Neighbours) -> Iterator[Row]:
+def _unheard(around: Neighbours) -> list[Row]:
     """Who is there on a topic though no message passes."""
-    publish = {'output': 'set io.best_effort to true', 'reference': 'publish it reliable'}
-    for role, topic in zip(('output', 'reference', 'control'), around[:3], strict=True):
-        for peer in topic.peers:
-            if peer.unfit == 'type':
-                text = f'{topic} is sent as {peer.kind}, {topic.kind} is wanted: change {peer}' \
-                    if role in publish \
-                    else f'{topic} is a {topic.kind}, but {peer} wants {peer.kind}: change it'
-            elif role not in publish:
-                text = f'{topic} does not reach {peer}: its QoS does not fit'
-            elif peer.unfit == 'reliability':
-                text = f'{topic} is sent best effort, which does not arrive: {publish[role]}'
-            else:
-                text = f'{topic} of {peer} does not arrive: its QoS does not fit'
-            if peer.unfit:
-                yield f'{role} {peer.unfit}', Level.ERROR, True, text
+    sent = '{0} is sent as {1.kind}, {0.kind} is wanted: change {1}'
+    best_effort = '{0} is sent best effort, which does not arrive: '
+    texts = {
+        'output type': sent, 'output reliability': best_effort + 'set io.best_effort to true',
+        'reference type': sent, 'reference reliability': best_effort + 'publish it reliable',
+        'control type': '{0} is a {0.kind}, but {1} wants {1.kind}: change it',
+        'control qos': '{0} does not reach {1}: its QoS does not fit',
+    }
+    other = '{0} of {1} does not arrive: its QoS does not fit'
+    return [
+        (kind, Level.ERROR, True, texts.get(kind, other).format(topic, peer))
+        for role, topic in zip(('output', 'reference', 'control'), around[:3], strict=True)
+        for peer in topic.peers if peer.unfit for kind in [f'{role} {peer.unfit}']
+    ]
 
 
 def causes_of(f: LoopFigures) -> tuple[Row, ...]:
@@ -291,19 +275,18 @@ def causes_of(f: LoopFigures) -> tuple[Row, ...]:
     y, y_m, v, rivals = f.around
     timing, status = f.timing, f.learning.status
     rate, age_s, period_s = timing.rate, timing.age_s, timing.nominal_s
-    due = f.heard + f.lost
+    heard, due = f.heard, f.heard + f.lost
     begins = status is None and f.silent_s == 0.0
     runs = status is not None and f.silent_s == 0.0
     late_ms, clocks = f'{1e3 * abs(age_s):.3g} ms', 'set both clocks (chrony, PTP)'
-
-    def fits(topic: TopicFigures) -> bool:
-        return len(topic.heard) == len(topic.peers)
-
+    # In samples where the gap is known, else in time.
+    stands_still = f.still >= 20 and f.v_swing > f.gap if isfinite(f.gap) \
+        else f.still * period_s >= 5.0 and f.v_swing > 0.0
     return (
         *_unheard(f.around),
         # What comes is of no use.
-        ('bad outputs', warn if f.used else error, f.bad_outputs > TROUBLE * f.heard,
-         f'{_percent(f.bad_outputs, f.heard)} of {y} is no finite number: check the sensor'),
+        ('bad outputs', warn if f.used else error, f.bad_outputs > TROUBLE * heard,
+         f'{_percent(f.bad_outputs, heard)} of {y} is no finite number: check the sensor'),
         ('bad references', warn, f.bad_references > 0,
          f'{f.bad_references} {y_m} messages lately were no finite number: the last good one '
          'holds'),
@@ -321,10 +304,11 @@ def causes_of(f: LoopFigures) -> tuple[Row, ...]:
         # What does not come.
         ('silent', warn, f.silent_s > 0.0,
          f'no {y} for {f.silent_s:g} s: is the driver running? on_timeout: {f.on_timeout}'),
-        ('waiting for output', warn, begins and f.heard == 0 and fits(y),
+        ('waiting for output', warn, begins and heard == 0 and len(y.heard) == len(y.peers),
          y.waiting('start the driver')),
         ('waiting for reference', warn,
-         begins and f.reference_silent_s == inf and f.bad_references == 0 and fits(y_m),
+         begins and f.reference_silent_s == inf and f.bad_references == 0
+         and len(y_m.heard) == len(y_m.peers),
          y_m.waiting('start one')),
         ('unheard', warn, runs and not v.peers,
          f'nobody listens to {v}: is it the name that the driver uses?'),
@@ -350,7 +334,7 @@ def causes_of(f: LoopFigures) -> tuple[Row, ...]:
          f'no {y_m} for more than {f.reference_silent_s:g} s, the last one is held: publish it '
          'every sample'),
         # What becomes of v.
-        ('still', warn, f.stands_still,
+        ('still', warn, stands_still,
          f'{y} stands still while v swings over {f.v_swing:.3g}'
          + (f' ({f.v_swing / f.gap:.3g} gaps)' if f.gap > 0.0 else '')
          + ': check sensor, actuator, its controller'),
@@ -368,19 +352,12 @@ def causes_of(f: LoopFigures) -> tuple[Row, ...]:
     )
 
 
-def _beyond(found: OutOfBounds | None) -> str:
-    if found is None:
-        return ''
-    name, value, (low, high) = found
-    return f'{name} is {value:.4g}, beyond estimator.bounds.{name} [{low:g}, {high:g}]: widen it' \
-        + ('' if name == 'm' else ', or correct the zero of y')
-
-
 def _states_beside(causes: set[str], f: LoopFigures) -> tuple[Row, ...]:
     """The table of states where causes of these kinds were found: the first that holds counts."""
     ok, warn, error = Level
     y, (status, law, inconsistent_s, adapting, given) = f.around.output, f.learning
     share = 100.0 * law.unexplained
+    name, value, (low, high) = law.forbidden or OutOfBounds('', nan, (nan, nan))
     # Neither rate nor lateness turns a sign.
     held = status == Status.INCONSISTENT and not law.wrong_sign
     # Where a tenth is late or lost nobody can tell what else is wrong; nor for some seconds else.
@@ -400,7 +377,8 @@ def _states_beside(causes: set[str], f: LoopFigures) -> tuple[Row, ...]:
         ('known', ok, law.unconfirmed and status == Status.ACQUIRING,
          'estimates of before hold: only a v at several speeds could confirm them'),
         ('bound', warn, law.forbidden is not None and status == Status.ACQUIRING,
-         _beyond(law.forbidden)),
+         f'{name} is {value:.4g}, beyond estimator.bounds.{name} [{low:g}, {high:g}]: widen it'
+         + (', or correct the zero of y' if name != 'm' else '')),
         ('undecided', ok, law.undecided and status == Status.ACQUIRING,
          'learning: several gaps explain y alike: let v move between more than two values'),
         ('acquiring', ok, status == Status.ACQUIRING,

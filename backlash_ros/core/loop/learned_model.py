@@ -8,9 +8,9 @@ from math import nan
 
 import numpy as np
 
-from backlash_ros.core.assembly import build_model
 from backlash_ros.core.law import Law
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.scenario import build_model
 
 # At which the response of G is judged, as shares of the sampling rate: from slow motion to where
 # little is left of it.
@@ -57,9 +57,7 @@ def learned_model_of(law: Law, p: Parameters) -> LearnedModel:
     """What a law believes of G now: that of the parameters where it does not learn it."""
     learned, report = law.learned_model, law.report
     model = build_model(p) if learned is None else learned.transfer_function
-    numerator, denominator, delay = model.without_delay()
     response_std = law.response_std(np.exp(2j * np.pi * np.array(FREQUENCIES)))
-    return LearnedModel(
-        tuple(numerator), tuple(denominator), delay, tuple(response_std.tolist()),
-        report.noise_ratio, report.unexplained,
-    )
+    numerator, denominator, delay = model.without_delay()
+    return LearnedModel(tuple(numerator), tuple(denominator), delay, tuple(response_std.tolist()),
+                        report.noise_ratio, report.unexplained)

@@ -26,6 +26,8 @@ class Counts:
     extra: int = 0  # outputs that were repeated, too early, old or of a second driver
     interruptions: int = 0  # times that the driver was silent or restarted
     limited: int = 0  # commands that met a limit
+    wraps: int = 0  # times that y jumped by 2 pi
+    dead_workers: int = 0  # processes for fits that died
 
     @property
     def dropped(self) -> int:
@@ -33,7 +35,6 @@ class Counts:
         return self.bad_outputs + self.bad_references + self.bad_reports
 
     def by_name(self) -> dict[str, int]:
-        """All of them."""
         return {each.name: getattr(self, each.name) for each in fields(Counts)}
 
 
@@ -43,15 +44,14 @@ class LoopStatistics(Counts):
 
     still_band: by how much y may differ where it stands still. still: newest values of y in a row
     that are equal; still_v: lowest and highest v meanwhile. v_range: those since they were asked
-    for. wraps: times that y jumped by 2 pi. inconsistent: newest samples in a row that contradict
-    the estimate. latencies [s]: the newest ones, as topics.py defines them.
+    for. inconsistent: newest samples in a row that contradict the estimate. latencies [s]: the
+    newest ones, as topics.py defines them.
     """
 
     still_band: float = 0.0
     still: int = 0
     still_v: tuple[float, float] = (inf, -inf)
     v_range: tuple[float, float] = (inf, -inf)
-    wraps: int = 0
     inconsistent: int = 0
     latencies: deque[float] = field(default_factory=lambda: deque(maxlen=1000))
     _y: float = nan  # with which the newest row of equal values began
@@ -61,8 +61,7 @@ class LoopStatistics(Counts):
     @property
     def still_swing(self) -> float:
         """How far v has moved while y stands still."""
-        low, high = self.still_v
-        return max(high - low, 0.0)
+        return max(self.still_v[1] - self.still_v[0], 0.0)
 
     def note(self, y: float, v: float, limited: bool, inconsistent: bool, latency: float) -> None:
         """Count an output and the command that it brought."""
@@ -93,8 +92,7 @@ class LoopStatistics(Counts):
 
 
 def _with(value: float, bounds: tuple[float, float]) -> tuple[float, float]:
-    low, high = bounds
-    return min(value, low), max(value, high)
+    return min(value, bounds[0]), max(value, bounds[1])
 
 
 class Lately:
