@@ -198,7 +198,7 @@ def figures_of_loop(
         ),
         standing_down=loop.standing_down, on_timeout=p.on_timeout,
         silent_s=p.timeout.plant_output if loop.silent else 0.0,
-        reference_silent_s=inf if not isfinite(loop.heard.y_m) else p.timeout.reference * unreferred,
+        reference_silent_s=p.timeout.reference * unreferred if isfinite(loop.heard.y_m) else inf,
         still=statistics.still, v_swing=statistics.still_swing,
         gap=estimate.c_r - estimate.c_l if estimate.learned else nan,
     )

@@ -69,7 +69,6 @@ class JointLoops:
         return steps
 
     def take_references(self, y_m: Mapping[str, float]) -> None:
-        """Take in references by joint."""
         for joint, value in y_m.items():
             self.by_name[joint].take_reference(value)
 

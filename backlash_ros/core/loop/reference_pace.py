@@ -21,10 +21,9 @@ class ReferencePace:
     """
 
     def __init__(self, period_s: float, waits: bool, now_s: float, own_clock: bool = True) -> None:
-        self.waits = waits
-        self._period_s, self._own_clock = period_s, own_clock
-        self._heard = self._fresh = False  # any output; one that is not answered yet
-        self._heard_s = -inf
+        self.waits, self._period_s, self._own_clock = waits, period_s, own_clock
+        self._fresh = False  # an output that is not answered yet
+        self._heard_s = -inf  # when the newest output came
         self._offset = 0  # sample of y_m that follows the newest output, less its index
         self._next = 0  # sample that follows the newest output
         self._sent = -1
@@ -32,13 +31,12 @@ class ReferencePace:
 
     def hear(self, index: int, at_s: float) -> None:
         """Take in that output number `index` has come at this time."""
-        if not self._heard:
+        if self._heard_s == -inf:
             self._offset = 1 if self.waits else self._next - index
         # Where the own clock has run ahead, y_m does not go back.
         self._offset = max(self._offset, self._sent - index)
         self._next = index + self._offset
-        self._heard = self._fresh = True
-        self._heard_s, self.waits = at_s, False
+        self._fresh, self._heard_s, self.waits = True, at_s, False
 
     def listens(self, now_s: float) -> bool:
         """Whether it is time to look for an output, and to wait for one if none is there."""
@@ -53,7 +51,7 @@ class ReferencePace:
         period, sample = self._period_s, self._next
         if now_s < self._due_s:
             return None
-        if not self._heard:
+        if self._heard_s == -inf:
             # Messages that were due while the process was held up are not made up for.
             self._due_s = max(self._due_s, now_s - 0.5 * period) + period
             self._next += not self.waits
@@ -78,5 +76,5 @@ class ReferencePace:
 
     @property
     def _give_up_s(self) -> float:
-        """When an output that has not come yet counts as lost."""
+        # When an output that has not come yet counts as lost.
         return max(self._due_s, self._heard_s + (1.0 + JITTER) * self._period_s)

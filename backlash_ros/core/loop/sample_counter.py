@@ -1,4 +1,4 @@
-"""Which sample of the plant a message holds, and how many were skipped before it."""
+"""Which sample of the plant a message holds, how many were skipped, and when a driver samples."""
 
 from __future__ import annotations
 
@@ -14,6 +14,12 @@ Array = NDArray[np.float64]
 
 # Share by which a period has to be off to be taken for another one than that of the model.
 OTHER_PERIOD = 0.003
+# What the middleware reports where it does not number messages.
+UNNUMBERED = 2**64 - 1
+# A stamp never comes before its sample, so a missing one shows as a full period of lateness.
+# Jitter of the sender up to this share of a period is not taken for a loss.
+JITTER = 0.85
+CLOCK_SLACK = 0.01  # share of a period by which the sender's clock may run slow per sample
 
 
 class Period(NamedTuple):
@@ -149,12 +155,18 @@ class DriverPeriod:
             return Period()
         apart = 1 + len(times) // 300  # neighbours tell the same
         times = times[::apart]
-        found = _slope(np.array(_numbered(times.tolist(), typical)), times, apart)
+        numbers = np.array(_numbered(times.tolist(), typical))
+        n, t = numbers - numbers.mean(), times - times.mean()
+        spread = float(n @ n)
+        slope = float(n @ t) / spread if spread else nan
+        rest = float(np.mean((t - slope * n) ** 2))
         # Beyond such a scatter, as of a driver that is held up all the time, nobody can tell from
         # the stamps which samples were left out.
-        if not (found.mean > 0.0 and found.scatter < 0.2 * nominal_s):
+        if not (slope > 0.0 and sqrt(rest) < 0.2 * nominal_s):
             return Period()
-        return found._replace(median=float(ordered[len(ordered) // 2]))
+        # A process that is held up is late for some ten samples, whose lateness is one error.
+        std = sqrt(max(10.0 / apart, 1.0) * rest / spread)
+        return Period(slope, std, float(ordered[len(ordered) // 2]), sqrt(rest))
 
 
 def _numbered(times: list[float], period_s: float) -> list[float]:
@@ -167,26 +179,6 @@ def _numbered(times: list[float], period_s: float) -> list[float]:
         late = time - due - passed * period_s
         due += passed * period_s + min(late, 0.01 * period_s)
     return numbers
-
-
-def _slope(numbers: Array, times: Array, apart: int) -> Period:
-    """The straight line through the times of samples, of which every apart-th is here."""
-    n, t = numbers - numbers.mean(), times - times.mean()
-    spread = float(n @ n)
-    if not spread:
-        return Period()
-    slope = float(n @ t) / spread
-    rest = float(np.mean((t - slope * n) ** 2))
-    # A process that is held up is late for some ten samples, whose lateness is one error.
-    return Period(slope, sqrt(max(10.0 / apart, 1.0) * rest / spread), scatter=sqrt(rest))
-
-
-# What the middleware reports where it does not number messages.
-UNNUMBERED = 2**64 - 1
-# A stamp never comes before its sample, so a missing one shows as a full period of lateness.
-# Jitter of the sender up to this share of a period is not taken for a loss.
-JITTER = 0.85
-CLOCK_SLACK = 0.01  # share of a period by which the sender's clock may run slow per sample
 
 
 class Output(NamedTuple):
@@ -213,9 +205,8 @@ class Arrival(NamedTuple):
     """What a message is.
 
     is_sample: False for repetitions, floods, old messages and second senders. missing: samples
-    that never came before this one. unsent: those of them that the sender cannot have published,
-    for it has not numbered them. restarted: sender or clock did, so nothing is known of what
-    the plant did in between.
+    that never came before this one. unsent: those of them that the sender has not numbered, and so
+    not published. restarted: sender or clock did: nobody knows what the plant did in between.
     """
 
     is_sample: bool = True
@@ -253,11 +244,6 @@ class SampleCounter:
         self._on_time = 0  # samples that came when they were due, less the early ones
         self._strange = 0  # messages in a row that do not follow the newest sample
 
-    @property
-    def _keeps_time(self) -> bool:
-        """Whether what comes much earlier than the next sample is due is refused."""
-        return self._on_time >= 20
-
     def count(
         self, stamp_ns: int, sequence: int = UNNUMBERED, numbered: bool = True,
         received_ns: int = 0,
@@ -267,12 +253,11 @@ class SampleCounter:
         numbered = numbered and known
         self.sender.hear(stamp_ns, received_ns)
         self.sender.learn()
-        period, keeps_time = self.sender.period_ns, self._keeps_time
+        period = self.sender.period_ns
+        keeps_time = self._on_time >= 20  # so what comes much too early is refused
         if self.index < 0:
-            if not self._from_zero:
-                self.index = round(stamp_ns / period)
-            else:
-                self.index = max(sequence - 1, 0) if numbered else 0
+            self.index = round(stamp_ns / period) if not self._from_zero \
+                else max(sequence - 1, 0) if numbered else 0
             self._begin(stamp_ns, sequence)
             return NEXT_SAMPLE
         if stamp_ns < self._stamp_ns:
@@ -309,14 +294,14 @@ class SampleCounter:
             self._on_time = max(self._on_time + (-2 if is_early else 1), 0)
         self._sequence = self._repeated = sequence
         self._stamp_ns, self._strange = stamp_ns, 0
-        self._follow_phase(stamp_ns, missing)
+        self._follow_phase(stamp_ns, missing, 20 if self._on_time >= 20 else 6)
         self.sender.follow(stamp_ns)
         self.index += 1 + missing
         if not missing:
             return NEXT_SAMPLE
         return Arrival(missing=missing, unsent=max(missing - skipped, 0) if known else 0)
 
-    def _follow_phase(self, stamp_ns: int, missing: int) -> None:
+    def _follow_phase(self, stamp_ns: int, missing: int, window: int) -> None:
         """Go on to the sample with this stamp, before which so many are missing."""
         period, latenesses = self.sender.period_ns, self._lateness_ns
         expected = self.due_ns + period * (1 + missing)
@@ -325,10 +310,8 @@ class SampleCounter:
         shift = min(late, period * CLOCK_SLACK)
         # Where so many in a row all came later than expected, the sender has paused, and the least
         # lateness among them is its new phase.
-        window = 20 if self._keeps_time else 6
         if shift > 0.0 and len(latenesses) >= window:
-            least = min(islice(reversed(latenesses), window))
-            shift = max(shift, least - self._shifted_ns)
+            shift = max(shift, min(islice(reversed(latenesses), window)) - self._shifted_ns)
         self._shifted_ns += shift
         self.due_ns = expected + shift
         # Who was held up for some samples comes back to the old phase: this one lags behind.
