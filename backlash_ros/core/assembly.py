@@ -32,7 +32,7 @@ from backlash_ros.core.laws.gradient import GradientEstimator
 from backlash_ros.core.laws.input_reconstruction import InputReconstruction
 from backlash_ros.core.laws.lms import NormalisedLms
 from backlash_ros.core.laws.printed_law import PrintedLaw
-from backlash_ros.core.parameters import BY_NAME, ParameterError, Parameters, PlantModel
+from backlash_ros.core.parameters import BY_NAME, ParameterError, Parameters
 from backlash_ros.core.plant.numerics import FourBlocks, place_poles
 from backlash_ros.core.plant.transfer_function import (
     StateModel,
@@ -184,9 +184,9 @@ def known_before(p: Parameters) -> Estimate:
 
 def takes_model_as_exact(p: Parameters) -> bool:
     """Whether a G other than that of the paper's example is taken as exact by a law that learns."""
-    plant, paper = p.plant, PlantModel()
-    of_paper = (plant.numerator, plant.denominator) == (paper.numerator, paper.denominator)
-    return p.estimator.law == 'moving_horizon' and not plant.uncertainty and not of_paper
+    of_paper = all(p[name] == BY_NAME[name].default
+                   for name in ('plant.numerator', 'plant.denominator'))
+    return p.estimator.law == 'moving_horizon' and not p.plant.uncertainty and not of_paper
 
 
 def warnings_of(p: Parameters, with_reference: bool = True) -> list[str]:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, fields
-from functools import partial
+from dataclasses import dataclass, field
+from functools import cache, partial
 from math import inf, isfinite, isinf, isnan
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import Any, get_args, get_type_hints
+
+Value = bool | int | float | str | tuple[float, ...] | tuple[str, ...]
 
 UNTOLD = object()  # in place of a value that has nothing to do with the error
 
@@ -19,10 +21,6 @@ class ParameterError(ValueError):
         self.name = name
         message = f'{name} {rule}' if value is UNTOLD else f'{name}={value!r} {rule}'
         super().__init__(f'{message}: {cure}' if cure else message)
-
-
-Value = bool | int | float | str | tuple[float, ...] | tuple[str, ...]
-Group = TypeVar('Group')
 
 
 @dataclass(frozen=True)
@@ -73,35 +71,37 @@ class Parameter:
 def option(
     default: Any, description: str, unit: str = '', choices: Iterable[str] = (), **rules: Any,
 ) -> Any:
-    """The field of a group that declares a parameter.
+    """What a group says of a parameter, in place of its default.
 
     choices: words; 'OLD=NEW' is one that stands for another. rules: fields of Parameter.
     """
     words = {word: meant or word for word, _, meant in (each.partition('=') for each in choices)}
-    return field(default=default, metadata={'declare': partial(
-        Parameter, default=default, description=description, unit=unit, choices=words, **rules,
-    )})
+    return partial(Parameter, default=default, description=description, unit=unit, choices=words,
+                   **rules)
+
+
+_types_in: Any = cache(get_type_hints)
 
 
 def declared_in(group: type[Any], prefix: str = '') -> Iterator[Parameter]:
     """The parameters of a group and of the groups in it."""
-    types = get_type_hints(group)
-    for each in fields(group):
-        name, kind = prefix + each.name, types[each.name]
-        if declare := each.metadata.get('declare'):
-            yield declare(name=name, elements=get_args(kind))
+    options = getattr(group, '_field_defaults', vars(group))
+    for name, kind in _types_in(group).items():
+        if isinstance(options.get(name), partial):
+            yield options[name](name=prefix + name, elements=get_args(kind))
         else:
-            yield from declared_in(kind, f'{name}.')
+            yield from declared_in(kind, f'{prefix}{name}.')
 
 
-def filled(group: type[Group], values: Mapping[str, Value], prefix: str = '') -> Group:
-    """A group with the values of its parameters, given by their names."""
-    untyped: Any = group
-    return group(**{
-        each.name: values[prefix + each.name] if each.metadata
-        else filled(type(each.default), values, f'{prefix}{each.name}.')
-        for each in fields(untyped)
-    })
+def attributes_of(
+    group: type[Any], values: Mapping[str, Value], prefix: str = '',
+) -> dict[str, Any]:
+    """Those of a group, from the values of its parameters by their names."""
+    return {
+        name: values[prefix + name] if prefix + name in values
+        else kind(**attributes_of(kind, values, f'{prefix}{name}.'))
+        for name, kind in _types_in(group).items()
+    }
 
 
 def as_yaml(value: Value) -> str:
@@ -121,7 +121,7 @@ def check_value(parameter: Parameter, value: object) -> Value:
     """Return value in the type of the parameter; raises ParameterError."""
     default, refused = parameter.default, partial(ParameterError, parameter.name)
     if isinstance(default, tuple):
-        return list_of_names(parameter, value) if parameter.names else _numbers(parameter, value)
+        return _names(parameter, value) if parameter.names else _numbers(parameter, value)
     if isinstance(default, bool) or 'true' in parameter.choices:
         # YAML and ROS 2 take true and false for more than words.
         value = str(value).lower() if isinstance(value, (bool, str)) else value
@@ -136,11 +136,12 @@ def check_value(parameter: Parameter, value: object) -> Value:
             raise refused(value, 'must be one of ' + ', '.join(parameter.choices))
         return parameter.choices.get(value, value)
     number = _number(parameter, value)
-    if isinstance(default, int) and number != int(number):
+    if isinstance(default, float):
+        return number
+    if number != int(number):
         raise refused(value, 'must be a whole number')
     # Beyond 2^53 the detour over a float would lose digits.
-    return number if isinstance(default, float) else value if isinstance(value, int) \
-        else int(number)
+    return value if isinstance(value, int) else int(number)
 
 
 def _elements(parameter: Parameter, value: object) -> list[object]:
@@ -153,8 +154,7 @@ def _elements(parameter: Parameter, value: object) -> list[object]:
     return list(value)
 
 
-def list_of_names(parameter: Parameter, value: object) -> tuple[str, ...]:
-    """Return a list of names, each once; raises ParameterError."""
+def _names(parameter: Parameter, value: object) -> tuple[str, ...]:
     names = _elements(parameter, value)
     namespace = re.compile('[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*')  # as ROS takes it
     for name in names:

@@ -6,9 +6,9 @@ is then its value in a set of Parameters, and `control.max` its name everywhere 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 from math import inf
+from typing import NamedTuple
 
 from backlash_ros.core.parameters.parameter import Parameter, declared_in, option
 
@@ -25,8 +25,7 @@ of_node = partial(option, per_node=True, change='never')
 silence = partial(option, unit='s', low=0.0, high=3600.0, change='live', per_node=True)
 
 
-@dataclass(frozen=True)
-class PlantModel:
+class PlantModel(NamedTuple):
     numerator: tuple[float, ...] = of_both(
         (1e-05, 4e-05, 1e-05), 'numerator of G(z), descending powers of z')
     denominator: tuple[float, ...] = of_both(
@@ -37,8 +36,7 @@ class PlantModel:
     adapt: bool = option(True, 'redesign gains and preview for the G that was learned')
 
 
-@dataclass(frozen=True)
-class ActuatorModel:
+class ActuatorModel(NamedTuple):
     numerator: tuple[float, ...] = of_both(
         (), 'numerator of L(z), from control to the motor encoder that applied_control reports; '
         'empty: the command is what acts on the gap')
@@ -48,15 +46,13 @@ class ActuatorModel:
         'of the load, on its right and on its left side', 'v')
 
 
-@dataclass(frozen=True)
-class InitialEstimate:
+class InitialEstimate(NamedTuple):
     m: float = option(0.696, 'first estimate of the slope', 'u/v', low=0.0, above=True)
     c_r: float = option(0.5, 'first estimate of the right crossing', 'v')
     c_l: float = option(-0.5, 'first estimate of the left crossing', 'v')
 
 
-@dataclass(frozen=True)
-class EstimateBounds:
+class EstimateBounds(NamedTuple):
     m: tuple[float, float] = option(
         (0.01, 100.0), 'interval of the slope', 'u/v', low=0.0, above=True)
     c_r: tuple[float, float] = option(
@@ -65,8 +61,7 @@ class EstimateBounds:
         (-100.0, 100.0), 'interval of the left crossing, which an offset of u moves too', 'v')
 
 
-@dataclass(frozen=True)
-class EstimatorOptions:
+class EstimatorOptions(NamedTuple):
     law: str = option(
         'moving_horizon', 'law that learns m, c_r, c_l; kalman: a former name of moving_horizon',
         choices=('moving_horizon', 'kalman=moving_horizon', 'lms', 'printed', 'fixed', 'gradient'))
@@ -90,8 +85,7 @@ class EstimatorOptions:
         low=10, high=1000)
 
 
-@dataclass(frozen=True)
-class LmsSteps:
+class LmsSteps(NamedTuple):
     step: float = option(
         1.0, 'step of the normalised LMS on (m, m c_r, m c_l)', low=0.0, high=2.0, above=True,
         change='live')
@@ -99,19 +93,16 @@ class LmsSteps:
         0.0, 'step of the normalised LMS on f, 0 keeps f', low=0.0, high=2.0, change='live')
 
 
-@dataclass(frozen=True)
-class GradientStep:
+class GradientStep(NamedTuple):
     step: float = option(1.0, 'gradient: step on (m, m c_r, m c_l)', low=0.0, high=2.0, above=True)
 
 
-@dataclass(frozen=True)
-class ProportionalGain:
+class ProportionalGain(NamedTuple):
     f: float = option(0.22, 'gain f of u_d = y_m + f v (3.2)', 'u/v')
     bounds: tuple[float, float] = option((-0.5, 0.5), 'interval of f when the law adapts it', 'u/v')
 
 
-@dataclass(frozen=True)
-class TrackingWeights:
+class TrackingWeights(NamedTuple):
     preview: int = option(
         60, 'tracking: samples of y_m looked at ahead; y follows y_m delayed by as many',
         'samples', low=0, high=10000)
@@ -124,14 +115,12 @@ class TrackingWeights:
         'law learns, as effective crossings take up a constant disturbance', low=0.0, change='live')
 
 
-@dataclass(frozen=True)
-class PolePlacementFilter:
+class PolePlacementFilter(NamedTuple):
     filter_pole: float = option(
         0.6, 'pole_placement: pole of the filters of u_d and y', low=0.0, high=0.999)
 
 
-@dataclass(frozen=True)
-class InverseOptions:
+class InverseOptions(NamedTuple):
     caution: float = option(
         1.0, 'tracking: standard deviations by which the crossings are shrunk', low=0.0,
         high=100.0, change='live')
@@ -142,14 +131,12 @@ class InverseOptions:
         'over to a line that new estimates have moved', 'v/s', low=0.0, above=True, change='live')
 
 
-@dataclass(frozen=True)
-class FixedDoubt:
+class FixedDoubt(NamedTuple):
     doubt: float = option(
         0.0, 'fixed: how much of the motion of u the given constants may get wrong', low=0.0)
 
 
-@dataclass(frozen=True)
-class ControlLimits:
+class ControlLimits(NamedTuple):
     delay_samples: int = of_both(
         0, 'samples between control and its effect', 'samples', low=0, high=100)
     min: float = option(-inf, 'smallest v', 'v', change='live')
@@ -163,8 +150,7 @@ class ControlLimits:
         'not known', 'v')
 
 
-@dataclass(frozen=True)
-class Timeouts:
+class Timeouts(NamedTuple):
     plant_output: float = silence(
         0.5, 'longest silence of plant_output before on_timeout is done, 0 for never')
     reference: float = silence(
@@ -172,8 +158,7 @@ class Timeouts:
     ramp: float = silence(0.5, 'longest ramp at the end; a v that is not at zero by then is held')
 
 
-@dataclass(frozen=True)
-class SavedEstimates:
+class SavedEstimates(NamedTuple):
     file: str = option(
         '', 'file that learned estimates are saved in, empty for none', per_node=True)
     load: bool = option(
@@ -183,8 +168,7 @@ class SavedEstimates:
         's', low=0.0, high=86400.0, change='live', per_node=True)
 
 
-@dataclass(frozen=True)
-class DriverMessages:
+class DriverMessages(NamedTuple):
     style: str = of_node(
         'native', 'native: Float64 on plant_output and control; ros2_control: JointState on '
         'joint_states and Float64MultiArray on forward_command_controller/commands; '
@@ -210,8 +194,7 @@ class DriverMessages:
         used_by=(CONTROLLER, REFERENCE_NODE, RECORDER))
 
 
-@dataclass(frozen=True)
-class SimulatedBacklash:
+class SimulatedBacklash(NamedTuple):
     m: float = simulated(1.3, 'simulated slope', 'u/v', low=0.0, above=True, change='live')
     c_r: float = simulated(3.0, 'simulated right crossing', 'v', change='live')
     c_l: float = simulated(-3.0, 'simulated left crossing', 'v', change='live')
@@ -224,8 +207,7 @@ class SimulatedBacklash:
         (0.0, 0.0, 0.0), 'simulated step of m, c_r, c_l', change='live')
 
 
-@dataclass(frozen=True)
-class TruePlant:
+class TruePlant(NamedTuple):
     numerator: tuple[float, ...] = simulated(
         (), 'numerator of the simulated G(z), empty: plant.numerator')
     denominator: tuple[float, ...] = simulated(
@@ -245,33 +227,32 @@ class TruePlant:
         'input_disturbance it is no part of the u that plant/truth shows', 'u', low=0.0)
 
 
-@dataclass(frozen=True)
 class ParameterTree:
     """All parameters: `tree.control.max` is the value of control.max."""
 
     sample_period: float = option(
         0.01, 'sample period T of G(z)', 's', low=0.0, above=True,
         used_by=(CONTROLLER, PLANT, REFERENCE_NODE), per_node=True)
-    plant: PlantModel = PlantModel()
-    actuator: ActuatorModel = ActuatorModel()
+    plant: PlantModel
+    actuator: ActuatorModel
     lockstep: bool = of_node(
         False, 'run as fast as the machine allows: each sample waits for reference and control',
         used_by=(CONTROLLER, PLANT, REFERENCE_NODE, RECORDER))
     wait_for_subscribers: int = of_node(
         0, 'start only when the main topic has this many listeners', low=0,
         used_by=(CONTROLLER, PLANT, REFERENCE_NODE))
-    estimator: EstimatorOptions = EstimatorOptions()
-    lms: LmsSteps = LmsSteps()
-    gradient: GradientStep = GradientStep()
+    estimator: EstimatorOptions
+    lms: LmsSteps
+    gradient: GradientStep
     structure: str = option(
         'proportional', 'linear part that makes u_d',
         choices=('proportional', 'tracking', 'pole_placement'))
-    proportional: ProportionalGain = ProportionalGain()
-    tracking: TrackingWeights = TrackingWeights()
-    pole_placement: PolePlacementFilter = PolePlacementFilter()
-    inverse: InverseOptions = InverseOptions()
-    fixed: FixedDoubt = FixedDoubt()
-    control: ControlLimits = ControlLimits()
+    proportional: ProportionalGain
+    tracking: TrackingWeights
+    pole_placement: PolePlacementFilter
+    inverse: InverseOptions
+    fixed: FixedDoubt
+    control: ControlLimits
     autostart: bool = of_node(True, 'configure and activate at the start, without being asked')
     on_stop: str = option(
         'hold', 'last command at deactivation and at the end: v is held, set to zero as fast as '
@@ -284,20 +265,20 @@ class ParameterTree:
         'stand_down', 'what to do where another node published control before this one was '
         'activated: publish nothing until it is gone, or go on and report it',
         choices=('stand_down', 'warn'), change='live', per_node=True)
-    timeout: Timeouts = Timeouts()
-    estimates: SavedEstimates = SavedEstimates()
+    timeout: Timeouts
+    estimates: SavedEstimates
     joints: tuple[str, ...] = of_node(
         (), 'joints of an arm, each a loop of its own in one controller, in the order of their '
         'commands in an array; empty for one loop')
-    io: DriverMessages = DriverMessages()
-    backlash: SimulatedBacklash = SimulatedBacklash()
+    io: DriverMessages
+    backlash: SimulatedBacklash
     output_noise_std: float = simulated(0.0, 'simulated noise on y', 'y', low=0.0, change='live')
     output_quantum: float = simulated(
         0.0, 'simulated resolution of y, 0 for none', 'y', low=0.0, change='live')
     output_loss: float = simulated(
         0.0, 'simulated share of y that never arrives', low=0.0, high=0.99, change='live')
     input_disturbance: float = simulated(0.0, 'simulated constant added to u', 'u', change='live')
-    truth: TruePlant = TruePlant()
+    truth: TruePlant
     seed: int = simulated(1, 'seed of the simulated noise', low=0)
     samples: int = simulated(0, 'outputs to simulate, 0 for no end', low=0)
     waveform: str = of_reference(
