@@ -8,11 +8,10 @@ from pathlib import Path
 
 def write_atomically(path: Path, content: str | bytes) -> None:
     """Write content to a temporary file beside path and rename it."""
-    data = content.encode('utf-8') if isinstance(content, str) else content
     temporary = _beside(path)
     try:
         with temporary.open('wb') as file:
-            file.write(data)
+            file.write(content.encode() if isinstance(content, str) else content)
             file.flush()
             # Otherwise a power cut may leave the new name with nothing behind it.
             os.fsync(file.fileno())

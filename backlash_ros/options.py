@@ -1,19 +1,20 @@
-"""What every command line has in common: exit codes, errors in one line, positive numbers."""
+"""What every command line has in common: exit codes, errors in one line, numbers, shipped files."""
 
 from __future__ import annotations
 
 import argparse
+import importlib
+import sys
 from math import inf
+from pathlib import Path
 from typing import Any, NoReturn
 
 DONE, FAILED, BAD_INPUT = 0, 1, 2  # exit codes
+DEFAULT_CONFIG = 'paper_example.yaml'
 
 
 class OptionParser(argparse.ArgumentParser):
-    """Ends the process with one line where an option is wrong, like any other bad input.
-
-    hint: what is said after the error.
-    """
+    """Ends the process with one line, and `hint` behind it, where an option is wrong."""
 
     def __init__(self, prog: str, hint: str = ' (--help lists the options)', **others: Any) -> None:
         super().__init__(prog, **others)
@@ -29,6 +30,14 @@ def positive(text: str) -> float:
     number = float(text)
     if not 0.0 < number < inf:
         raise argparse.ArgumentTypeError(f'{text} must be finite and > 0')
+    return number
+
+
+def port(text: str) -> int:
+    """An option that is a port of TCP; argparse reports what is none."""
+    number = int(text)
+    if not 0 <= number <= 65535:
+        raise argparse.ArgumentTypeError(f'{text} must be from 0 (a free one) to 65535')
     return number
 
 
@@ -52,9 +61,20 @@ def add_motion_options(
                         help='drive: stop when y leaves this range')
 
 
-def port(text: str) -> int:
-    """An option that is a port of TCP; argparse reports what is none."""
-    number = int(text)
-    if not 0 <= number <= 65535:
-        raise argparse.ArgumentTypeError(f'{text} must be from 0 (a free one) to 65535')
-    return number
+def find_config(config: Path | None) -> Path:
+    """Path of a configuration file: as given, or else among the shipped ones by name.
+
+    None is the shipped example of the paper.
+    """
+    if config is not None and (config.exists() or config.parent != Path()):
+        return config
+    package, given = 'backlash_ros', config or Path(DEFAULT_CONFIG)
+    # The source tree first: beside the code that runs lies the configuration written for it.
+    folders = [Path(__file__).resolve().parents[1], Path(sys.prefix) / 'share' / package]
+    try:
+        ament_index = importlib.import_module('ament_index_python.packages')
+        folders.insert(1, Path(ament_index.get_package_share_directory(package)))
+    except (ImportError, LookupError, OSError):
+        pass  # no ament index here, or the package is not in it
+    files = (folder / 'config' / given.name for folder in folders)
+    return next(filter(Path.exists, files), given)

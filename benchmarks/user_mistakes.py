@@ -29,8 +29,7 @@ from real_time.measuring import DEADLINE_S, MeasuringNode, node_command, process
 from reporting import CHECK_HEADER, ROOT, Check, format_table, machine, parser_of, processors
 
 from backlash_ros import topics
-from backlash_ros.tools.bringup.environment import free_domain
-from backlash_ros.tools.bringup.supervisor import Child
+from backlash_ros.tools.bringup.supervisor import Child, free_domain
 
 BOUND_S, LONGEST_S = 3.0, 15.0  # in which a line is to be there, and that it is waited for
 SOUND_S = 3.0  # of the loop before a mistake that is made while it runs

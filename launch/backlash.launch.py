@@ -8,7 +8,7 @@ from launch.actions import DeclareLaunchArgument, ExecuteProcess, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from backlash_ros.shipped import DEFAULT_CONFIG, find_config
+from backlash_ros.options import DEFAULT_CONFIG, find_config
 
 ARGUMENTS = {
     'config': (DEFAULT_CONFIG, 'parameter file, or the name of a shipped one'),

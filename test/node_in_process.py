@@ -30,7 +30,7 @@ from backlash_ros.core.loop.sample_counter import Output
 from backlash_ros.middleware import prefer_loopback
 from backlash_ros.nodes.controller import ControllerNode
 from backlash_ros.nodes.runtime.executor import PromptExecutor
-from backlash_ros.tools.bringup.environment import free_domain
+from backlash_ros.tools.bringup.supervisor import free_domain
 
 START_NS = 1_800_000_000_000_000_000
 NOISE = 1e-3

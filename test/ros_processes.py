@@ -28,7 +28,7 @@ from rclpy.task import Future
 from waiting import DEADLINE_S, wait_until
 
 from backlash_ros.middleware import prefer_loopback
-from backlash_ros.tools.bringup.environment import child_environment, free_domain
+from backlash_ros.tools.bringup.supervisor import child_environment, free_domain
 
 prefer_loopback(os.environ)  # the nodes of the tests themselves
 

@@ -17,8 +17,7 @@ from backlash_ros.core.driver_check.verdict import WRONG, Judgement, all_fit, ju
 from backlash_ros.core.identification.motion import waves
 from backlash_ros.nodes.drive.motion_node import MotionNode
 from backlash_ros.nodes.runtime.process import ros_arguments, run
-from backlash_ros.options import DONE, FAILED, OptionParser, add_motion_options
-from backlash_ros.shipped import find_config
+from backlash_ros.options import DONE, FAILED, OptionParser, add_motion_options, find_config
 
 
 class CheckDriverNode(MotionNode):

@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Sequence
 from math import inf
 from pathlib import Path
-from types import FrameType
 from typing import Any, NamedTuple
 
 from backlash_ros.core.parameters import ParameterError, Parameters
@@ -38,38 +37,29 @@ class Span(NamedTuple):
 
 
 WHOLE_SPAN = Span()
-
-
 # What several tools offer, by the name of the option.
 OPTIONS: dict[str, dict[str, Any]] = {
-    '--config': {
-        'type': Path, 'metavar': 'FILE', 'help': 'ROS 2 parameter file, or the name of a shipped '
-        "one (default: parameters.yaml beside a recorded run, else the paper's example)"},
-    '--set': {
-        'action': 'append', 'default': [], 'metavar': '[AXIS/]KEY=VALUE', 'dest': 'settings',
-        'help': 'change one parameter, of all axes or of one; may be given again'},
-    '--sweep': {
-        'action': 'append', 'default': [], 'metavar': 'KEY=v1,v2,...',
-        'help': 'run every value of a parameter; given again, every combination'},
-    '--columns': {
-        'type': parse_columns, 'default': {}, 'metavar': 't=…,v=…,y=…', 'help': 'which columns of '
-        'a table, or signals of a bag, these are (default: told by their names)'},
-    '--axis': {
-        'default': '', 'metavar': 'NAME', 'help': 'of several axes or joints: the one that is '
-        'meant'},
+    '--config': {'type': Path, 'metavar': 'FILE', 'help': 'ROS 2 parameter file, or the name of a '
+                 "shipped one (default: what stands beside a recorded run, else the paper's "
+                 'example)'},
+    '--set': {'action': 'append', 'default': [], 'metavar': '[AXIS/]KEY=VALUE', 'dest': 'settings',
+              'help': 'change one parameter, of all axes or of one; may be given again'},
+    '--sweep': {'action': 'append', 'default': [], 'metavar': 'KEY=v1,v2,...', 'help': 'run every '
+                'value of a parameter; given again, every combination'},
+    '--columns': {'type': parse_columns, 'default': {}, 'metavar': 't=…,v=…,y=…', 'help': 'which '
+                  'columns of a table, or signals of a bag, these are (default: told by their '
+                  'names)'},
+    '--axis': {'default': '', 'metavar': 'NAME', 'help': 'of several axes or joints: the one that '
+               'is meant'},
     '--seed': {'type': int, 'metavar': 'N', 'help': 'seed of the simulated noise'},
-    '--duration': {
-        'type': float, 'metavar': 'SECONDS',
-        'help': 'length of a run (default: the parameter samples, or 10 s)'},
-    '--from': {
-        'type': float, 'default': 0.0, 'metavar': 'S', 'dest': 'from_s',
-        'help': 'leave out what was before this time [s]'},
-    '--to': {
-        'type': float, 'default': inf, 'metavar': 'S', 'dest': 'to_s',
-        'help': 'leave out what was from this time [s] on'},
-    '--out': {
-        'type': Path, 'metavar': 'DIR', 'help': 'folder of the results (default: results/<UTC '
-        'time>, and results/latest points at it)'},
+    '--duration': {'type': float, 'metavar': 'SECONDS', 'help': 'length of a run (default: the '
+                   'parameter samples, or 10 s)'},
+    '--from': {'type': float, 'default': 0.0, 'metavar': 'S', 'dest': 'from_s',
+               'help': 'leave out what was before this time [s]'},
+    '--to': {'type': float, 'default': inf, 'metavar': 'S', 'dest': 'to_s',
+             'help': 'leave out what was from this time [s] on'},
+    '--out': {'type': Path, 'metavar': 'DIR', 'help': 'folder of the results (default: results/'
+              '<UTC time>, and results/latest points at it)'},
 }
 
 
@@ -100,13 +90,13 @@ def number_of_samples(parameters: Parameters, duration: float | None) -> int:
     # It may miss a whole number by rounding alone.
     if samples < 1 or abs(duration / period - samples) > 1e-6 * samples:
         raise InputError(
-            f'--duration={duration!r} must be a whole multiple of sample_period={period!r}'
-        )
+            f'--duration={duration!r} must be a whole multiple of sample_period={period!r}')
     return samples
 
 
 def run_tool(
-    name: str, tool: Callable[[Sequence[str] | None], None], args: Sequence[str] | None = None,
+    name: str, tool: Callable[[Sequence[str] | None], int | None],
+    args: Sequence[str] | None = None,
 ) -> int:
     """Run a tool and return its exit code; whatever stops it becomes one line on stderr.
 
@@ -116,8 +106,7 @@ def run_tool(
     # The interpreter takes a while to end, in which another Ctrl-C would change the exit code.
     atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
     try:
-        tool(args)
-        return DONE
+        return tool(args) or DONE
     except (ParameterError, InputError) as error:
         message, code = str(error), BAD_INPUT
     except SystemExit as ended:
@@ -180,7 +169,7 @@ class StopRequests:
         for caught, handler in self._before.items():
             signal.signal(caught, handler)
 
-    def _note(self, number: int, frame: FrameType | None) -> None:
+    def _note(self, number: int, _: object) -> None:
         self.count += time.monotonic() > self._came_at_s + 0.2
         self._came_at_s = time.monotonic()
         self.last = signal.Signals(number).name

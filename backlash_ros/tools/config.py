@@ -27,7 +27,7 @@ from backlash_ros.core.parameters import (
     check_value,
     entry_of,
 )
-from backlash_ros.shipped import find_config
+from backlash_ros.options import find_config
 from backlash_ros.tools.cli import InputError
 
 ANY = '**'

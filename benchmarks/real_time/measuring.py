@@ -18,8 +18,12 @@ from rclpy.node import Node
 
 from backlash_ros.middleware import prefer_loopback
 from backlash_ros.nodes.runtime.executor import PromptExecutor
-from backlash_ros.tools.bringup.environment import child_environment, free_domain
-from backlash_ros.tools.bringup.supervisor import Child, ProcessSupervisor
+from backlash_ros.tools.bringup.supervisor import (
+    Child,
+    ProcessSupervisor,
+    child_environment,
+    free_domain,
+)
 
 DEADLINE_S = 30.0  # for processes to start
 

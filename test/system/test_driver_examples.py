@@ -11,7 +11,7 @@ import pytest
 from bringup_processes import UNDRAWN
 from places import ROOT
 
-from backlash_ros.tools.bringup.environment import child_environment, free_domain
+from backlash_ros.tools.bringup.supervisor import child_environment, free_domain
 
 BLOCKS = re.findall(
     r'^```bash\n(.*?)^```', (ROOT / 'docs' / 'driver.md').read_text(), re.MULTILINE | re.DOTALL

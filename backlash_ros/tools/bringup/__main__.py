@@ -34,21 +34,14 @@ environment: the processes inherit it. Unless you set them yourself,
 from __future__ import annotations
 
 import argparse
-import os
 import signal
 import sys
 from collections.abc import Sequence
-from contextlib import ExitStack
-from typing import TYPE_CHECKING
+from functools import partial
 
-from backlash_ros import topics
 from backlash_ros.options import DONE, FAILED, OptionParser, port
 from backlash_ros.tools import cli
-from backlash_ros.tools.cli import BrokenOffError, InputError, StopRequests
-
-if TYPE_CHECKING:
-    from backlash_ros.tools.bringup.plan import AxisPlan, RunPlan
-    from backlash_ros.tools.bringup.watch import RunWatch
+from backlash_ros.tools.cli import StopRequests
 
 
 def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -70,90 +63,20 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_args(arguments)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    code = DONE
+def _bringup(arguments: Sequence[str] | None) -> int:
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
-
-    def bringup(arguments: Sequence[str] | None) -> None:
-        nonlocal code
-        options = parse_options(arguments)
-        with StopRequests() as requests:
-            # numpy and scipy take a second to load, in which a Ctrl-C is to be heard already.
-            from backlash_ros.tools.bringup.plan import prepare
-            watch = run(prepare(options), requests)
-        reported = [axis.made > 0 and report(axis.plan) for axis in watch.axes.values()]
-        code = DONE if all(reported) and not watch.failure else FAILED
-
-    return cli.run_tool('bringup', bringup, arguments) or code
+    options = parse_options(arguments)
+    with StopRequests() as requests:
+        # numpy and scipy take a second to load, in which a Ctrl-C is to be heard already.
+        from backlash_ros.tools.bringup.plan import prepare
+        from backlash_ros.tools.bringup.watch import report, run
+        watch = run(prepare(options), requests)
+    reported = [axis.made > 0 and report(axis.plan) for axis in watch.axes.values()]
+    return DONE if all(reported) and not watch.failure else FAILED
 
 
-def run(plan: RunPlan, requests: StopRequests) -> RunWatch:
-    """Run all processes to the end; raises BrokenOffError where nothing can start."""
-    from backlash_ros.tools.bringup.environment import free_domain
-    from backlash_ros.tools.bringup.plan import ELSEWHERE, plan_processes
-    from backlash_ros.tools.bringup.supervisor import ProcessSupervisor
-    from backlash_ros.tools.bringup.watch import RunWatch
-    if requests.count:
-        raise BrokenOffError(f'interrupted by {requests.last}')
-    discovery = os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    awaited = [axis.name for axis in plan.axes if axis.parameters.driver == ELSEWHERE]
-    domain = None
-    with ExitStack() as stack:
-        if awaited:
-            # Whoever started the driver did so in the domain that is set there, or in none.
-            of = f' of {", ".join(awaited)}' if awaited != [''] else ''
-            print(f'waiting for the driver{of} as long as it takes: start it with ROS_DOMAIN_ID='
-                  f'{os.environ.get("ROS_DOMAIN_ID") or 0} '
-                  f'ROS_AUTOMATIC_DISCOVERY_RANGE={discovery}')
-        elif not os.environ.get('ROS_DOMAIN_ID'):
-            domain = stack.enter_context(free_domain())
-            print(f'to listen in: export ROS_DOMAIN_ID={domain} '
-                  f'ROS_AUTOMATIC_DISCOVERY_RANGE={discovery}')
-        for axis in plan.axes:
-            if not axis.parameters.autostart:
-                print(f'waiting until somebody activates {axis.process_name("controller")} '
-                      '(autostart: false)')
-            if axis.parameters.joints:
-                print('waiting for whoever plans the motion, on '
-                      f'{axis.process_name(topics.ROBOT_COMMAND)}')
-        sys.stdout.flush()
-        stages = plan_processes(plan, domain)
-        supervisor = stack.enter_context(ProcessSupervisor(stages, lambda: requests.count > 1))
-        watch = RunWatch(plan, supervisor, requests)
-        watch.execute()
-    return watch
-
-
-def report(axis: AxisPlan) -> bool:
-    """Write and print what came out of an axis; returns whether that worked."""
-    # Drawing libraries take a second to load: not before bad input is refused.
-    from backlash_ros.tools.bringup.watch import complain
-    from backlash_ros.tools.report import REPORT_PAGE, write_report
-    from backlash_ros.tools.runs.files import BAG
-    from backlash_ros.tools.runs.read_run import read_run
-    from backlash_ros.tools.runs.summary import estimate_table
-    if not axis.record:
-        print(axis.titled(f'no bag and no report (--no-record), logs in {axis.logs}'))
-        return True
-    good = True
-    # Joints have a folder each.
-    for joint in axis.parameters.joint_names:
-        out = axis.out / joint
-        try:
-            out.mkdir(exist_ok=True)
-            summary = write_report(read_run(axis.out / BAG, axis=joint), out)
-        except (InputError, OSError) as error:
-            complain(axis.titled(f'no report: {error}'))
-            good = False
-            continue
-        print(estimate_table(summary, '/'.join(filter(None, (axis.name, joint)))))
-        facts = f'{summary["samples"]} samples, {summary["lost_samples"]} lost'
-        if latency := summary['loop_latency_ms']:
-            facts += f', y to v within {latency["p50"]:.2f} ms (p50), {latency["p99"]:.2f} ms (p99)'
-        print(f'{facts}\nreport: {out / REPORT_PAGE}')
-    return good
-
+main = partial(cli.run_tool, 'bringup', _bringup)
 
 if __name__ == '__main__':
     sys.exit(main())

@@ -9,12 +9,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
+from typing import Any
 
 from backlash_ros.core.assembly import build_controller, build_plant, build_reference
 from backlash_ros.core.parameters import ParameterError, Parameters
 from backlash_ros.middleware import ROS_MISSING, ros_is_missing
-from backlash_ros.tools.bringup.environment import child_environment, foreign_environment
-from backlash_ros.tools.bringup.supervisor import Child
+from backlash_ros.tools.bringup.supervisor import Child, child_environment, foreign_environment
 from backlash_ros.tools.cli import BrokenOffError, InputError, number_of_samples, print_warnings
 from backlash_ros.tools.config import read_configuration, write_config
 from backlash_ros.tools.runs.files import BAG, CONFIG_FILE, result_directory
@@ -156,39 +156,54 @@ def plan_processes(plan: RunPlan, domain: int | None) -> list[list[Child]]:
     """The processes of a run by stages, which are to be stopped one after the other.
 
     A simulated plant stops first, so that no output stays without its answer. With a driver the
-    controller goes first and the driver hears its last command. The recorder goes last and so
-    has everything that the others have said. The references of joints come from whoever plans
-    their motion. domain: ROS_DOMAIN_ID to set, None to leave it alone.
+    controller goes first and the driver hears its last command. The recorder goes last and has
+    everything that the others have said. domain: ROS_DOMAIN_ID to set, None to leave it alone.
     """
     stages: list[list[Child]] = [[], [], [], []]
     served: dict[str, list[AxisPlan]] = {}
     for axis in plan.axes:
         p = axis.parameters
-        order = ('controller', '', '' if p.joints else 'reference', 'recorder') \
-            if p.driver else ('plant', 'reference', 'controller', 'recorder')
+        order = ('plant', 'reference', 'controller', 'recorder')
+        if p.driver:
+            order = ('controller', '', '' if p.joints else 'reference', 'recorder')
         for stage, node in zip(stages, order, strict=True):
             if node:
-                stage.append(_node(axis, node, domain))
+                stage.append(_child(
+                    axis, node, _arguments(axis, node), domain, axis.process_name(node),
+                    # The controller may end with a ramp, and then saves what it has learned.
+                    grace_s=p.timeout.ramp if node == 'controller' else 0.0))
         if p.driver and p.driver != ELSEWHERE:
             served.setdefault(p.driver, []).append(axis)
     # Axes with the very same command have one driver together.
-    stages[1] += [_driver(plan, command, axes, domain) for command, axes in served.items()]
-    if plan.live_port is not None:
-        first = plan.axes[0]
-        shown = [f'/{axis.name}' if axis.name else '/controller' for axis in plan.axes]
-        stages[-1].append(Child(
-            'live', (*_module('live'), '--port', str(plan.live_port), *shown),
-            first.logs / 'live.log', child_environment(first.logs, domain), first.name,
-            spectator=True,
+    for command, axes in served.items():
+        name, log = axes[0].process_name('driver'), axes[0].logs / 'driver.log'
+        if len(axes) > 1:
+            names = [axis.name for axis in axes]
+            name, log = f'driver of {", ".join(names)}', plan.out / f'logs/{"_".join(names)}.log'
+            log.parent.mkdir(exist_ok=True)
+        stages[1].append(Child(
+            name, tuple(shlex.split(command)), log,
+            foreign_environment(child_environment(log.parent, domain)), foreign=True,
+            # The last command of the controller acts from the next sample of the driver on.
+            settle_s=min(2.0 * max(axis.parameters.sample_period for axis in axes), 1.0),
         ))
+    if plan.live_port is not None:
+        shown = [f'/{axis.name}' if axis.name else '/controller' for axis in plan.axes]
+        stages[-1].append(_child(plan.axes[0], 'live', ['--port', str(plan.live_port), *shown],
+                                 domain, 'live', spectator=True))
     return stages
 
 
-def _module(name: str) -> tuple[str, ...]:
-    return sys.executable, '-m', f'backlash_ros.nodes.{name}'
+def _child(
+    axis: AxisPlan, node: str, arguments: Sequence[str], domain: int | None, name: str,
+    **others: Any,
+) -> Child:
+    return Child(
+        name, (sys.executable, '-m', f'backlash_ros.nodes.{node}', *arguments),
+        axis.logs / f'{node}.log', child_environment(axis.logs, domain), axis.name, **others)
 
 
-def _node(axis: AxisPlan, node: str, domain: int | None) -> Child:
+def _arguments(axis: AxisPlan, node: str) -> list[str]:
     lockstep = axis.parameters.lockstep
     if node == 'recorder':
         # In YAML, whatever stands in the path.
@@ -202,24 +217,4 @@ def _node(axis: AxisPlan, node: str, domain: int | None) -> Child:
         settings += ['-r', f'__ns:=/{axis.name}']
         if lockstep:
             settings += ['-r', '/clock:=clock']  # each axis has a time of its own
-    return Child(
-        axis.process_name(node),
-        (*_module(node), '--ros-args', '--params-file', str(axis.out / CONFIG_FILE), *settings),
-        axis.logs / f'{node}.log', child_environment(axis.logs, domain), axis.name,
-        # The controller may end with a ramp, and then saves what it has learned.
-        grace_s=axis.parameters.timeout.ramp if node == 'controller' else 0.0,
-    )
-
-
-def _driver(plan: RunPlan, command: str, axes: Sequence[AxisPlan], domain: int | None) -> Child:
-    name, log = axes[0].process_name('driver'), axes[0].logs / 'driver.log'
-    if len(axes) > 1:
-        names = [axis.name for axis in axes]
-        name, log = f'driver of {", ".join(names)}', plan.out / 'logs' / f'{"_".join(names)}.log'
-        log.parent.mkdir(exist_ok=True)
-    # The last command of the controller acts from the next sample of the driver on.
-    settle_s = min(2.0 * max(axis.parameters.sample_period for axis in axes), 1.0)
-    environment = foreign_environment(child_environment(log.parent, domain))
-    return Child(
-        name, tuple(shlex.split(command)), log, environment, foreign=True, settle_s=settle_s
-    )
+    return ['--ros-args', '--params-file', str(axis.out / CONFIG_FILE), *settings]

@@ -1,10 +1,8 @@
 """Child processes: started together, listened to, stopped in order, none of them left behind.
 
 Every child leads a process group of its own, so that a Ctrl-C of the terminal reaches the
-supervisor alone, which then stops the children in order, grandchildren included. A guardian, this
-module as a program, holds the other end of a pipe: when the supervisor dies of whatever cause, the
-pipe closes and the guardian stops what is left. Nothing here starts a thread: forking stays safe
-and a signal finds one loop to wake.
+supervisor alone. A guardian, this module as a program, holds the other end of a pipe: when the
+supervisor dies of whatever cause, the pipe closes and the guardian stops what is left.
 """
 
 from __future__ import annotations
@@ -13,32 +11,98 @@ import json
 import os
 import selectors
 import signal
+import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from backlash_ros.tools.bringup.environment import with_source
-from backlash_ros.tools.cli import BrokenOffError
+import backlash_ros
+from backlash_ros.middleware import prefer_loopback
+from backlash_ros.tools.cli import ONE_THREAD, BrokenOffError
 
 # SIGINT lets a node end as by Ctrl-C; a recorder may need a while to close a large bag.
 ESCALATION = ((signal.SIGINT, 10.0), (signal.SIGTERM, 3.0), (signal.SIGKILL, 3.0))
+Events = list[tuple['Child', dict[str, Any]]]
+
+
+def child_environment(log_folder: Path, domain: int | None) -> dict[str, str]:
+    """Environment of nodes that report events and are confined to this machine.
+
+    What the user has set stays. domain: ROS_DOMAIN_ID to set, None to leave it alone.
+    """
+    environment = {
+        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', 'ROS_LOG_DIR': str(log_folder / 'ros'),
+        **ONE_THREAD, **with_source(os.environ), 'BACKLASH_ROS_EVENTS': '1',
+        'PYTHONUNBUFFERED': '1', **({'ROS_DOMAIN_ID': str(domain)} if domain is not None else {}),
+    }
+    prefer_loopback(environment)  # for drivers; the nodes of this package do so themselves
+    return environment
+
+
+def with_source(environment: Mapping[str, str]) -> dict[str, str]:
+    """A copy in which Python finds this package, which need not be installed."""
+    source = str(Path(backlash_ros.__file__).resolve().parents[1])
+    # Behind the user's own entries it shadows nothing.
+    paths = filter(None, [*environment.get('PYTHONPATH', '').split(os.pathsep), source])
+    return {**environment, 'PYTHONPATH': os.pathsep.join(paths)}
+
+
+def foreign_environment(environment: Mapping[str, str]) -> dict[str, str]:
+    """The same for a program that is no node of this package and may be of another Python.
+
+    ROS 2 wheels have set variables for this Python alone, with which those of another one fail.
+    """
+    foreign = dict(environment)
+    foreign.pop('BACKLASH_ROS_EVENTS', None)
+    if foreign.pop('_ROS_WHEELS_BOOTSTRAP_COMPLETE', None):
+        folders = foreign.pop('LD_LIBRARY_PATH', '').split(os.pathsep)
+        kept = [folder for folder in folders if not Path(folder).is_relative_to(sys.prefix)]
+        foreign['LD_LIBRARY_PATH'] = os.pathsep.join(filter(None, kept))
+    return foreign
+
+
+@contextmanager
+def free_domain() -> Iterator[int]:
+    """A ROS_DOMAIN_ID that nobody on this machine uses, reserved as long as the context lasts.
+
+    Domain d has the UDP ports from 7400 + 250 d on, of which participant n takes 10 + 2 n and
+    11 + 2 n (RTPS 2.5, 9.6.2); a port that no participant ever uses reserves it. Raises
+    BrokenOffError if all are in use.
+    """
+    domains = 101  # those that lie below the ports that Linux hands out to others
+    # Starting at the process id spreads runs that start at the same moment.
+    for i in range(domains):
+        domain = 1 + (os.getpid() + i) % domains
+        port = 7400 + 250 * domain
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as reservation:
+            try:
+                reservation.bind(('', port + 5))
+                # As many participants as the discovery range LOCALHOST looks for.
+                for of_participant in range(port + 10, port + 74, 2):
+                    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+                        probe.bind(('', of_participant))
+            except OSError:
+                continue
+            yield domain
+            return
+    raise BrokenOffError(
+        f'every ROS_DOMAIN_ID from 1 to {domains} is in use on this machine: set one yourself'
+    )
 
 
 @dataclass(eq=False)
 class Child:
-    """A process, from plan to end.
+    """A process, from plan to end. axis: that its events are about.
 
-    name: in messages. axis: that its events are about. foreign: no node of this package: all that
-    it prints goes to its log, and signals reach it from the very start. spectator: the run goes on
-    without it. settle_s: time that passes before it is stopped, in which what was stopped before
-    still has an effect on it. grace_s: time that it needs for its end beyond what any process gets.
-    process: once it has started. unfinished: the beginning of a line of its output.
+    foreign: no node of this package: all that it prints goes to its log, and signals reach it from
+    the very start. spectator: the run goes on without it. settle_s: passes before it is stopped, as
+    what was stopped before still has an effect on it. grace_s: for its end, beyond the usual time.
     """
 
     name: str
@@ -71,10 +135,6 @@ class Child:
             ) from error
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-    @property
-    def has_ended(self) -> bool:
-        return self.process.poll() is not None
 
     def events(self, chunk: bytes) -> list[dict[str, Any]]:
         """JSON objects with `event` in the lines that end in this chunk; all else is logged."""
@@ -144,9 +204,9 @@ class ProcessSupervisor:
                 child.process.stdout.close()
         self._guardian.communicate(b'[]\n')
 
-    def events(self, timeout: float) -> list[tuple[Child, dict[str, Any]]]:
+    def events(self, timeout: float) -> Events:
         """What the processes have said; waits up to timeout [s] for a first word."""
-        found = []
+        found: Events = []
         for key, _ in self._selector.select(timeout):
             chunk = os.read(key.fd, 65536)
             if not chunk:
@@ -154,19 +214,15 @@ class ProcessSupervisor:
             found += [(key.data, content) for content in key.data.events(chunk)]
         return found
 
-    def stop(self) -> list[tuple[Child, dict[str, Any]]]:
+    def stop(self) -> Events:
         """Stop one stage after the other, each child with all its group; returns last words."""
-        last_words: list[tuple[Child, dict[str, Any]]] = []
-
-        def listen() -> None:
-            last_words.extend(self.events(0.02))
-
+        last_words: Events = []
         for stage in self._to_stop():
-            stop_groups(*stage, listen, self._hurry)
+            stop_groups(*stage, lambda: last_words.extend(self.events(0.02)), self._hurry)
         for child in self.children:
             child.process.poll()
         while self._selector.select(0.0):
-            listen()
+            last_words += self.events(0.0)
         return last_words
 
     def _to_stop(self) -> list[tuple[list[int], float, float]]:
@@ -214,11 +270,7 @@ def living(groups: Sequence[int]) -> set[int]:
 
 
 def guard(lines: Iterable[str]) -> None:
-    """Read what is running, stage by stage, until the end, then stop what stays.
-
-    Each line replaces the one before it. The end comes when the supervisor closes the pipe or the
-    kernel does it after its death.
-    """
+    """Stop what stays, stage by stage as the last line says, once the supervisor has gone."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     stages: Sequence[tuple[Sequence[int], float, float]] = []

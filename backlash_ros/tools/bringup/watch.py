@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import time
 from collections import Counter
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, field
-from math import inf
 from typing import Any
 
 from backlash_ros import topics
-from backlash_ros.tools.bringup.plan import ELSEWHERE, AxisPlan, RunPlan
-from backlash_ros.tools.bringup.supervisor import Child, ProcessSupervisor
-from backlash_ros.tools.cli import BrokenOffError, StopRequests, number
+from backlash_ros.tools.bringup.plan import ELSEWHERE, AxisPlan, RunPlan, plan_processes
+from backlash_ros.tools.bringup.supervisor import Child, ProcessSupervisor, free_domain
+from backlash_ros.tools.cli import BrokenOffError, InputError, StopRequests, number
+from backlash_ros.tools.runs.files import BAG
 
 START_DEADLINE_S = 30.0  # for the start of every process, and the first sample of a driver
 LATE_DEADLINE_S = 10.0  # that a run in real time may take longer than it should
@@ -82,35 +84,37 @@ class AxisProgress:
             self.first = sample if p.driver else 0
         made = sample + 1 - self.first
         self.heard = {'samples': made, **progress.get('received', {})}
-        if made > self.made:
-            self.made, self.moved, self.silent = made, time.monotonic(), False
-            if self.moved >= self.next_line:
-                # Every 2 s, and ever more seldom, so that a run of days does not fill the disk.
-                self.next_line = self.moved + max(2.0, 0.05 * (self.moved - self.began))
-                count = f'{made}/{p.samples}' if p.samples else f'{made}'
-                text = f'{made * p.sample_period:7.2f} s  {count}  {describe(progress)}'
-                complain(self.plan.titled(text), '')
+        if made <= self.made:
+            return
+        self.made, self.moved, self.silent = made, time.monotonic(), False
+        if self.moved >= self.next_line:
+            # Every 2 s, and ever more seldom, so that a run of days does not fill the disk.
+            self.next_line = self.moved + max(2.0, 0.05 * (self.moved - self.began))
+            count = f'{made}/{p.samples}' if p.samples else f'{made}'
+            text = f'{made * p.sample_period:7.2f} s  {count}  {describe(progress)}'
+            complain(self.plan.titled(text), '')
 
     def check_pace(self) -> None:
         """Raise BrokenOffError for samples that do not come."""
-        now, plan, p = time.monotonic(), self.plan, self.plan.parameters
-        due = inf if p.samples == 0 or p.lockstep else \
-            self.began + p.samples * p.sample_period + LATE_DEADLINE_S
-        at = f' after sample {self.first + self.made - 1}' if self.made else ''
-        silence, failure = f'no new sample for {self.patience:g} s{at}', ''
+        now, plan, p, failure = time.monotonic(), self.plan, self.plan.parameters, ''
         if self.complete:
             return
         if p.driver and self.made == 0:
             if p.driver != ELSEWHERE and now > self.began + START_DEADLINE_S:
                 failure = (f'no sample within {START_DEADLINE_S:g} s: does the driver publish its '
                            'output? Where it needs longer, start it yourself (--driver none)')
-        elif now > due:
+        elif p.samples and not p.lockstep and \
+                now > self.began + p.samples * p.sample_period + LATE_DEADLINE_S:
             failure = (f'only {self.made} of {p.samples} samples, {LATE_DEADLINE_S:g} s after the '
                        'end was due')
-        elif now > self.moved + self.patience and not self.silent:
+        elif now > self.moved + self.patience:
+            at = f' after sample {self.first + self.made - 1}' if self.made else ''
+            silence = f'no new sample for {self.patience:g} s{at}'
             # The controller knows what to do when a real plant falls silent.
-            self.silent, failure = True, '' if p.driver else silence
-            if p.driver:
+            if not p.driver:
+                failure = silence
+            elif not self.silent:
+                self.silent = True
                 complain(plan.titled(f'{silence}, waiting for the driver'))
         if failure:
             raise BrokenOffError(plan.titled(f'{failure}, see {plan.logs}'))
@@ -143,17 +147,29 @@ class RunWatch:
                 self._listen()
                 for axis in axes:
                     axis.check_pace()
-            self._catch_up()
+            # The middleware sends again what got lost on the way to a recorder that was held up,
+            # with its own settings every 3 s.
+            deadline = time.monotonic() + 10.0
+            while not self._over and time.monotonic() < deadline and any(a.unheard for a in axes):
+                self._listen()
+            for axis in axes:
+                if axis.unheard:
+                    missing = ', '.join(f'{count} {what}' for what, count in axis.unheard.items())
+                    complain(axis.plan.titled(
+                        f'the plant has published more than the recorder heard: {missing}'))
             if self._over:
                 complain(f'{self._requests.last} ends the run')
         except BrokenOffError as error:
             # Said before the processes are stopped, which may take a while.
-            self.failure = str(error)
-            complain(self.failure)
+            self._fail(str(error))
         for child, content in self._supervisor.stop():
             self._note(child, content)
         if not self.failure:
             self._judge_exits()
+
+    def _fail(self, failure: str) -> None:
+        self.failure = failure
+        complain(failure)
 
     @property
     def _over(self) -> bool:
@@ -178,20 +194,6 @@ class RunWatch:
                     *(f'the end of {child.end_of_log()}' for child in late),
                 ]))
 
-    def _catch_up(self) -> None:
-        """Wait until the recorder has heard all that was published, and say what is missing."""
-        # The middleware sends again what got lost on the way to a recorder that was held up, with
-        # its own settings every 3 s.
-        deadline, axes = time.monotonic() + 10.0, self.axes.values()
-        while not self._over and time.monotonic() < deadline and any(a.unheard for a in axes):
-            self._listen()
-        for axis in axes:
-            if axis.unheard:
-                missing = ', '.join(f'{count} {what}' for what, count in axis.unheard.items())
-                complain(axis.plan.titled(
-                    f'the plant has published more than the recorder heard: {missing}'
-                ))
-
     def _listen(self) -> None:
         for child, content in self._supervisor.events(0.1):
             self._note(child, content)
@@ -199,7 +201,7 @@ class RunWatch:
             raise BrokenOffError(f'interrupted by {self._requests.last}, stopping')
         dead = []
         for child in self._supervisor.children:
-            if not child.has_ended or child.name in self._gone:
+            if child.process.poll() is None or child.name in self._gone:
                 continue
             if child.spectator and child.name in self._ready:
                 self._gone.add(child.name)
@@ -232,8 +234,68 @@ class RunWatch:
             if code == 0 or child.name in self._gone:
                 continue
             if not child.foreign or code == -signal.SIGKILL:
-                self.failure = child.describe_end('did not stop cleanly')
-                complain(self.failure)
+                self._fail(child.describe_end('did not stop cleanly'))
             elif code not in stopped:
                 # How a program of the user says good-bye is its own affair.
                 complain(child.describe_end('was stopped'))
+
+
+def run(plan: RunPlan, requests: StopRequests) -> RunWatch:
+    """Run all processes to the end; raises BrokenOffError where nothing can start."""
+    if requests.count:
+        raise BrokenOffError(f'interrupted by {requests.last}')
+    discovery = os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    awaited = [axis.name for axis in plan.axes if axis.parameters.driver == ELSEWHERE]
+    domain = None
+    with ExitStack() as stack:
+        if awaited:
+            # Whoever started the driver did so in the domain that is set there, or in none.
+            of = f' of {", ".join(awaited)}' if awaited != [''] else ''
+            print(f'waiting for the driver{of} as long as it takes: start it with ROS_DOMAIN_ID='
+                  f'{os.environ.get("ROS_DOMAIN_ID") or 0} '
+                  f'ROS_AUTOMATIC_DISCOVERY_RANGE={discovery}')
+        elif not os.environ.get('ROS_DOMAIN_ID'):
+            domain = stack.enter_context(free_domain())
+            print(f'to listen in: export ROS_DOMAIN_ID={domain} '
+                  f'ROS_AUTOMATIC_DISCOVERY_RANGE={discovery}')
+        for axis in plan.axes:
+            if not axis.parameters.autostart:
+                print(f'waiting until somebody activates {axis.process_name("controller")} '
+                      '(autostart: false)')
+            if axis.parameters.joints:
+                print('waiting for whoever plans the motion, on '
+                      f'{axis.process_name(topics.ROBOT_COMMAND)}')
+        sys.stdout.flush()
+        stages = plan_processes(plan, domain)
+        supervisor = stack.enter_context(ProcessSupervisor(stages, lambda: requests.count > 1))
+        watch = RunWatch(plan, supervisor, requests)
+        watch.execute()
+    return watch
+
+
+def report(axis: AxisPlan) -> bool:
+    """Write and print what came out of an axis; returns whether that worked."""
+    # Drawing libraries take a second to load: not before bad input is refused.
+    from backlash_ros.tools.report import REPORT_PAGE, write_report
+    from backlash_ros.tools.runs.read_run import read_run
+    from backlash_ros.tools.runs.summary import estimate_table
+    if not axis.record:
+        print(axis.titled(f'no bag and no report (--no-record), logs in {axis.logs}'))
+        return True
+    good = True
+    # Joints have a folder each.
+    for joint in axis.parameters.joint_names:
+        out = axis.out / joint
+        try:
+            out.mkdir(exist_ok=True)
+            summary = write_report(read_run(axis.out / BAG, axis=joint), out)
+        except (InputError, OSError) as error:
+            complain(axis.titled(f'no report: {error}'))
+            good = False
+            continue
+        print(estimate_table(summary, '/'.join(filter(None, (axis.name, joint)))))
+        facts = f'{summary["samples"]} samples, {summary["lost_samples"]} lost'
+        if latency := summary['loop_latency_ms']:
+            facts += f', y to v within {latency["p50"]:.2f} ms (p50), {latency["p99"]:.2f} ms (p99)'
+        print(f'{facts}\nreport: {out / REPORT_PAGE}')
+    return good

@@ -11,7 +11,7 @@ from node_in_process import START_NS, node_with
 from rclpy.parameter import Parameter
 
 from backlash_ros.core.loop.sample_counter import Output
-from backlash_ros.tools.bringup.environment import free_domain
+from backlash_ros.tools.bringup.supervisor import free_domain
 
 JOINTS = ('waist', 'elbow', 'gripper')
 AT_ZERO = dict.fromkeys(JOINTS, 0.0)

@@ -18,7 +18,7 @@ from std_srvs.srv import Trigger
 
 from backlash_ros.nodes.live import HOST, PageServer
 from backlash_ros.nodes.runtime.executor import PromptExecutor
-from backlash_ros.tools.bringup.environment import free_domain
+from backlash_ros.tools.bringup.supervisor import free_domain
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import pytest
 from waiting import DEADLINE_S, wait_until
 
 from backlash_ros.tools import batch
-from backlash_ros.tools.bringup.environment import with_source
+from backlash_ros.tools.bringup.supervisor import with_source
 from backlash_ros.tools.simulate import main
 
 RUNS = ['--duration', '1', '--set', 'output_noise_std=1e-3', '--seeds', '6']

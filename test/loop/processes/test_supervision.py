@@ -13,9 +13,8 @@ from bringup_processes import DEADLINE_S, MARK, marked_processes, wait_until
 
 from backlash_ros.tools.bringup import supervisor as supervising
 from backlash_ros.tools.bringup import watch as watching
-from backlash_ros.tools.bringup.environment import child_environment
 from backlash_ros.tools.bringup.plan import AxisPlan, RunPlan
-from backlash_ros.tools.bringup.supervisor import Child, ProcessSupervisor
+from backlash_ros.tools.bringup.supervisor import Child, ProcessSupervisor, child_environment
 from backlash_ros.tools.cli import StopRequests
 from backlash_ros.tools.config import effective_parameters
 

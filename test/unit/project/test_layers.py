@@ -13,8 +13,7 @@ PACKAGE = 'backlash_ros'
 SHARED = {
     PACKAGE,
     *(f'{PACKAGE}.{name}' for name in (
-        'atomic_file', 'middleware', 'options',
-        'shipped', 'topics',
+        'atomic_file', 'middleware', 'options', 'topics',
     )),
 }
 LAYERS = ('core', 'bags', 'nodes', 'tools')

@@ -10,9 +10,8 @@ import yaml
 from places import ROOT
 
 from backlash_ros.tools.bringup import __main__ as bringup
-from backlash_ros.tools.bringup.environment import child_environment, foreign_environment
 from backlash_ros.tools.bringup.plan import AxisPlan, RunPlan, plan_processes, prepare
-from backlash_ros.tools.bringup.supervisor import Child
+from backlash_ros.tools.bringup.supervisor import Child, child_environment, foreign_environment
 from backlash_ros.tools.bringup.watch import (
     LATE_DEADLINE_S,
     START_DEADLINE_S,
