@@ -12,19 +12,15 @@ import numpy as np
 import yaml
 from rclpy.utilities import remove_ros_args
 
-from backlash_ros.core.driver_check.heard import timing_of
-from backlash_ros.core.driver_check.verdict import WRONG, Judgement, all_fit, judge, table
+from backlash_ros.core.driver_check import WRONG, Judgement, all_fit, judge, table, timing_of
 from backlash_ros.core.identification.motion import waves
-from backlash_ros.nodes.drive.motion_node import MotionNode
+from backlash_ros.nodes.drive import MotionNode
 from backlash_ros.nodes.runtime.process import ros_arguments, run
 from backlash_ros.options import DONE, FAILED, OptionParser, add_motion_options, find_config
 
 
 class CheckDriverNode(MotionNode):
     """Judges what it hears."""
-
-    def __init__(self, options: argparse.Namespace) -> None:
-        super().__init__('check_driver', options, waves)
 
     def tell(self) -> None:
         findings = judge(self.graph.in_the_end(), self.heard, self.settings)
@@ -54,7 +50,6 @@ class CheckDriverNode(MotionNode):
 
 
 def parse_options(plain: Sequence[str]) -> argparse.Namespace:
-    """Options besides those of ROS."""
     parser = OptionParser('check_driver', description=__doc__,
                           epilog='Exit codes: 0 all fits, 1 something does not, 2 bad input.')
     parser.add_argument('--config', metavar='FILE', help='ROS 2 parameter file of the controller, '
@@ -70,7 +65,7 @@ def parse_options(plain: Sequence[str]) -> argparse.Namespace:
     return options
 
 
-def parameter_files(config: str, folder: Path) -> list[str]:
+def _parameter_files(config: str, folder: Path) -> list[str]:
     """The file, and in folder one more with what it holds for the controller alone, if anything."""
     try:
         document = yaml.safe_load(Path(config).read_text(encoding='utf-8'))
@@ -93,9 +88,9 @@ def main(args: list[str] | None = None) -> int:
         given = ros_arguments(arguments)
         if options.config is not None:
             config = str(find_config(Path(options.config)))
-            for file in reversed(parameter_files(config, Path(folder))):
+            for file in reversed(_parameter_files(config, Path(folder))):
                 given = ['--ros-args', '--params-file', file, *given]
-        return run('check_driver', lambda: CheckDriverNode(options), given)
+        return run('check_driver', lambda: CheckDriverNode('check_driver', options, waves), given)
 
 
 if __name__ == '__main__':

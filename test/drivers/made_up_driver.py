@@ -7,8 +7,7 @@ from scipy.signal import cont2discrete
 
 from backlash_ros.core import Parameters, build_plant
 from backlash_ros.core.control.limits import Limits
-from backlash_ros.core.driver_check.heard import Graph, Heard, Message
-from backlash_ros.core.driver_check.verdict import FLOAT64, WRONG, Judgement, judge
+from backlash_ros.core.driver_check import FLOAT64, WRONG, Graph, Heard, Judgement, Message, judge
 from backlash_ros.core.identification.motion import Drive, waves
 
 PERIOD_S = 0.04  # long enough that a busy machine does not disturb it

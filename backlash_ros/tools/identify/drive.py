@@ -49,7 +49,7 @@ def drive(
         period = given.get('sample_period')
         write_config(Parameters(dict(given)), config)
         command = [
-            sys.executable, '-m', 'backlash_ros.nodes.identification_drive',
+            sys.executable, '-m', 'backlash_ros.nodes.drive',
             '--messages', str(path), '--config', str(config),
         ]
         for name in ('duration', 'wait', 'rest', 'amplitude', 'rate', 'output_range'):

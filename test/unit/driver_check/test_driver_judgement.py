@@ -23,12 +23,11 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from backlash_ros.core.control.limits import Limits
-from backlash_ros.core.driver_check.heard import Heard, Message
-from backlash_ros.core.driver_check.verdict import FLOAT64, UNKNOWN, all_fit, judge, table
+from backlash_ros.core.driver_check import FLOAT64, UNKNOWN, Heard, Message, all_fit, judge, table
 from backlash_ros.core.identification.motion import Drive, drive_limits, strokes, waves
 from backlash_ros.core.parameters import ParameterError, Parameters
 from backlash_ros.core.plant.transfer_function import TransferFunction
-from backlash_ros.nodes.drive.driver_graph import similar_topics
+from backlash_ros.nodes.driver_graph import similar_topics
 
 
 def test_a_good_driver_fits_and_its_backlash_is_told() -> None:
@@ -257,6 +256,6 @@ def test_similar_topics_are_named_first() -> None:
         '/motor/plant_output': [FLOAT64], '/plant_outputs': ['std_msgs/msg/Float32'],
         '/camera/image': ['sensor_msgs/msg/Image'], '/y': [FLOAT64],
     }
-    assert similar_topics('/plant_output', FLOAT64, seen) == [
+    assert similar_topics('/plant_output', seen) == [
         '/motor/plant_output', '/plant_outputs',
     ]

@@ -1,4 +1,7 @@
-"""Node that stands in for the controller: it hears a driver, and moves v gently if told to."""
+"""Node that stands in for the controller: it hears a driver, and moves v gently if told to.
+
+As a process it is the part of `identify --drive` that moves an actuator, and records.
+"""
 
 from __future__ import annotations
 
@@ -7,24 +10,26 @@ import sys
 import time
 from functools import partial
 from math import inf
+from pathlib import Path
 from typing import Any
 
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
+from rclpy.utilities import remove_ros_args
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_controller, build_limits
 from backlash_ros.core.control.limits import plausible
-from backlash_ros.core.driver_check.heard import Heard, Message
-from backlash_ros.core.identification.motion import Drive, Shape, drive_limits
-from backlash_ros.core.parameters import CONTROLLER
-from backlash_ros.nodes.control.rivals import Presence, identity_made_by
-from backlash_ros.nodes.drive.driver_graph import DriverGraph
+from backlash_ros.core.driver_check import Heard, Message
+from backlash_ros.core.identification.motion import Drive, Shape, drive_limits, strokes
+from backlash_ros.core.parameters.table import CONTROLLER
+from backlash_ros.nodes.control.rivals import Presence, identity_made_by, names_of
+from backlash_ros.nodes.driver_graph import DriverGraph
 from backlash_ros.nodes.runtime.executor import PromptExecutor
 from backlash_ros.nodes.runtime.messages import DEPTH
-from backlash_ros.nodes.runtime.process import ProcessNode
-from backlash_ros.options import BAD_INPUT, FAILED
+from backlash_ros.nodes.runtime.process import ProcessNode, ros_arguments, run
+from backlash_ros.options import BAD_INPUT, DONE, FAILED, add_motion_options
 
 LOOK_S = 0.1  # between two looks at the graph
 
@@ -33,10 +38,8 @@ class MotionNode(ProcessNode):
     """Hears a driver and, with --drive, answers every plant_output with a control.
 
     v is brought to rest at the end, whatever ends the motion. The parameters are those of the
-    controller.
-
-    heard: all messages. motion: v on its way, None before the first one. ended: why the motion
-    ended before its time, empty if it did not. names: full names of the topics.
+    controller. motion: v on its way, None before the first one. ended: why the motion ended before
+    its time, empty if it did not. names: full names of the topics.
     """
 
     def __init__(self, program: str, options: argparse.Namespace, shape: Shape) -> None:
@@ -57,8 +60,17 @@ class MotionNode(ProcessNode):
     def tell(self) -> None:
         """Say what came of it, and set the exit code."""
 
+    def look(self) -> None:
+        """Called every LOOK_S while the node listens."""
+        if self.options.drive:
+            # Once heard, a rival counts, even if it leaves.
+            self._rivals = self._rivals or names_of(self.graph.publishers(topics.CONTROL))
+        self.graph.look()
+
+    def say(self, text: str) -> None:
+        print(f'{self.get_name()}: {text}', file=sys.stderr)
+
     def work(self, executor: PromptExecutor) -> None:
-        """Wait for the driver, listen, come to rest, tell."""
         if self._await_driver(executor):
             try:
                 self._follow(executor)
@@ -70,17 +82,6 @@ class MotionNode(ProcessNode):
             self.exit_code = BAD_INPUT
         else:
             self.tell()
-
-    def look(self) -> None:
-        """Called every LOOK_S while the node listens."""
-        if self.options.drive:
-            # Once heard, a rival counts, even if it leaves.
-            self._rivals = self._rivals or self.graph.rivals()
-        self.graph.look()
-
-    def say(self, text: str) -> None:
-        """Tell the user in a line of stderr."""
-        print(f'{self.get_name()}: {text}', file=sys.stderr)
 
     def _await_driver(self, executor: PromptExecutor) -> bool:
         now = time.monotonic()
@@ -102,8 +103,8 @@ class MotionNode(ProcessNode):
         self._hear(topics.APPLIED_CONTROL)
         if driving:
             control = self.names[topics.CONTROL]
-            self._presence = Presence(self.context.get_domain_id(), control,
-                                      identity_made_by(self, control, self._advertise))
+            presence = Presence(self.context.get_domain_id(), control,
+                                identity_made_by(self, control, self._advertise))
         else:
             self._hear(topics.CONTROL)
         self._hear(topics.PLANT_OUTPUT)
@@ -122,7 +123,7 @@ class MotionNode(ProcessNode):
                 looked = now
                 self.look()
                 if driving and now > begin + settle_s:
-                    if self._presence.others():
+                    if presence.others():
                         self._rivals = self._rivals or 'a controller of this machine'
                     self._driving = self._control.get_subscription_count() > 0
             if self._driving and now > newest + patience:
@@ -191,3 +192,46 @@ class MotionNode(ProcessNode):
             if self._control.wait_for_all_acked(Duration(seconds=0.1)):
                 return
         self.say(f'the driver has not confirmed the last v={v:.6g}')
+
+
+class IdentificationDriveNode(MotionNode):
+    """Writes what it hears and sends as it goes: topic, time stamp [ns], value on each line."""
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        super().__init__('identify', options, strokes)
+        self._file = options.messages.open('w', encoding='ascii')
+        self._written = dict.fromkeys(self.heard.by_topic, 0)
+
+    def look(self) -> None:
+        super().look()
+        for topic, messages in self.heard.by_topic.items():
+            for message in messages[self._written[topic]:]:
+                print(topic, message.stamp_ns, repr(message.value), sep=',', file=self._file)
+            self._written[topic] = len(messages)
+        self._file.flush()
+
+    def tell(self) -> None:
+        if self.ended:
+            self.say(f'{self.ended}: drive ended')
+        if self.motion is None:
+            why = f'nobody subscribes to {self.names[topics.CONTROL]}' if self.heard.outputs \
+                else f'nothing was heard on {self.names[topics.PLANT_OUTPUT]}'
+            self.say(f'the actuator was not moved: {why}')
+        self.exit_code = FAILED if self.motion is None else DONE
+
+
+def main(args: list[str] | None = None) -> int:
+    """Entry point; returns the exit code. The options are those that `identify` has checked."""
+    arguments = sys.argv[1:] if args is None else args
+    parser = argparse.ArgumentParser(prog='identify')
+    parser.set_defaults(drive=True)
+    parser.add_argument('--messages', type=Path, required=True)
+    parser.add_argument('--config', required=True)
+    add_motion_options(parser, 10.0, 'how long to listen')
+    options = parser.parse_args(remove_ros_args(['', *arguments])[1:])
+    return run('identify', lambda: IdentificationDriveNode(options),
+               ['--ros-args', '--params-file', options.config, *ros_arguments(arguments)])
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -10,10 +10,8 @@ from rclpy.qos import QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from backlash_ros import topics
-from backlash_ros.core.driver_check.heard import Graph
-from backlash_ros.core.driver_check.verdict import FLOAT64
-from backlash_ros.core.parameters import RECORDER
-from backlash_ros.nodes.control.rivals import names_of
+from backlash_ros.core.driver_check import FLOAT64, Graph
+from backlash_ros.core.parameters.table import RECORDER
 from backlash_ros.nodes.runtime.messages import DEPTH
 
 
@@ -29,22 +27,16 @@ class DriverGraph:
         return [info for info in self._node.get_publishers_info_by_topic(self._names[topic])
                 if info.node_name != self._node.get_name()]
 
-    def rivals(self) -> str:
-        """Who else publishes v, empty for nobody."""
-        return names_of(self.publishers(topics.CONTROL))
-
     def profile(self, topic: str) -> QoSProfile:
         """The QoS that hears whoever publishes a topic."""
-        best_effort = _has_best_effort(self.publishers(topic))
-        return QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT if best_effort
-                          else ReliabilityPolicy.RELIABLE)
+        return QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT if
+                          _has_best_effort(self.publishers(topic)) else ReliabilityPolicy.RELIABLE)
 
     def look(self) -> None:
         """Take note of who is there now."""
         graph, outputs = self._graph, self.publishers(topics.PLANT_OUTPUT)
         listeners = self._others(
-            self._node.get_subscriptions_info_by_topic(self._names[topics.CONTROL])
-        )
+            self._node.get_subscriptions_info_by_topic(self._names[topics.CONTROL]))
         graph.publishers = max(graph.publishers, len(outputs))
         graph.listeners = max(graph.listeners, len(listeners))
         if outputs:
@@ -56,8 +48,7 @@ class DriverGraph:
     def in_the_end(self) -> Graph:
         """All that was noted, with topics that may have been meant for v."""
         listened_to = self._topics(self._node.get_subscriptions_info_by_topic)
-        wanted = self._names[topics.CONTROL]
-        self._graph.near_control = tuple(similar_topics(wanted, FLOAT64, listened_to))
+        self._graph.near_control = tuple(similar_topics(self._names[topics.CONTROL], listened_to))
         return self._graph
 
     def say_what_is_missing(self) -> None:
@@ -65,7 +56,7 @@ class DriverGraph:
         wanted = self._names[topics.PLANT_OUTPUT]
         seen = self._topics(self._node.get_publishers_info_by_topic)
         print(f'waiting for {wanted} ({FLOAT64})')
-        near = similar_topics(wanted, FLOAT64, seen)
+        near = similar_topics(wanted, seen)
         for topic in near:
             print(f'  sees {topic} ({", ".join(seen[topic])}); if that is it: '
                   f'--ros-args -r {topics.PLANT_OUTPUT}:={topic}')
@@ -96,12 +87,12 @@ def _misfit(asked: QoSProfile) -> str:
     return f'control: {reason}' if compatibility == QoSCompatibility.ERROR else ''
 
 
-def similar_topics(wanted: str, wanted_type: str, seen: Mapping[str, Sequence[str]]) -> list[str]:
+def similar_topics(wanted: str, seen: Mapping[str, Sequence[str]]) -> list[str]:
     """Topics (with their types) that may be the wanted one under another name, likeliest first."""
     def likeness(topic: str) -> float:
         last, other = (name.rsplit('/', 1)[-1] for name in (wanted, topic))
         return difflib.SequenceMatcher(None, last, other).ratio() - 1e-9 * len(topic) + 0.1 * (
-            wanted_type in seen[topic])
+            FLOAT64 in seen[topic])
 
     return sorted((topic for topic in seen if topic != wanted and likeness(topic) >= 0.6),
                   key=likeness, reverse=True)

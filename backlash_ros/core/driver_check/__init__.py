@@ -1,1 +1,0 @@
-"""What makes a driver good: messages, timing, motion; and how v is moved to see it."""
