@@ -10,17 +10,11 @@ import numpy as np
 from backlash_ros.core.control.controller import AdaptiveController
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.limits import Limits, check_last_commands
-from backlash_ros.core.control.paper_structure import Proportional
-from backlash_ros.core.control.pole_placement import PolePlacement
+from backlash_ros.core.control.paper_structure import PolePlacement, Proportional
 from backlash_ros.core.control.protocol import ControlStructure
 from backlash_ros.core.control.serial_plant import DOUBT, SerialPlant
-from backlash_ros.core.control.tracking.design import (
-    Weights,
-    better_design,
-    design,
-    lq_gains,
-    power_gain,
-)
+from backlash_ros.core.control.tracking.design import Weights, better_design, design, power_gain
+from backlash_ros.core.control.tracking.lq_preview import preview_gains
 from backlash_ros.core.control.tracking.tracking import Tracking
 from backlash_ros.core.estimate import Bounds, Estimate
 from backlash_ros.core.estimates_file import load_estimate
@@ -142,7 +136,7 @@ def build_four_blocks(p: Parameters) -> FourBlocks:
     """The gains of `pole_placement`, placed where those of `tracking` put the poles of G."""
     state = build_state_model(p, commanded=True)
     model = state.transfer_function
-    gains = lq_gains(state, p.tracking.input_weight * power_gain(model, np.pi / 10.0))
+    gains = preview_gains(state, p.tracking.input_weight * power_gain(model, np.pi / 10.0))
     closed = np.real(np.poly(state.a - np.outer(state.b, gains.state)))
     return place_poles(model, closed, p.pole_placement.filter_pole)
 

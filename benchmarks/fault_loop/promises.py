@@ -99,7 +99,7 @@ class PromisedBound:
         if self._structure != 'tracking':
             return 0.0
         model, t = build_state_model(self._p), self._p.tracking
-        gains = (feedback_around(model, Weights(weight, t.integral_weight, t.preview), 1.0).gain
+        gains = (feedback_around(model, Weights(weight, t.integral_weight, t.preview), 1.0).state
                  for weight in self._weights)
         return TOLERANCE * self._noise * max(float(np.linalg.norm(gain)) for gain in gains)
 

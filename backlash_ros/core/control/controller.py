@@ -1,24 +1,26 @@
-"""The adaptive backlash inverse controller: estimator, structure, inverse and limits."""
+"""The adaptive controller: estimator, structure, inverse and limits, and the way of a better G."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
-from dataclasses import replace
-from math import nan
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.limits import LARGEST_SIGNAL, Limits, at_rest, plausible
 from backlash_ros.core.control.protocol import ControlInput, ControlStructure
-from backlash_ros.core.control.redesign import Redesign
 from backlash_ros.core.control.serial_plant import SerialPlant
 from backlash_ros.core.estimate import Estimate
-from backlash_ros.core.jobs import Executor
+from backlash_ros.core.jobs import LOST, Channel, Executor, Failure
 from backlash_ros.core.law import Interval, Law, StateSource
+from backlash_ros.core.plant.transfer_function import StateModel
 
 # Lost outputs in a row that are stepped over; after more nothing is left to predict from them.
 LONGEST_GAP = 1000
+# Samples after which a better design takes over though v crosses the gap: an unstable loop never
+# stops to.
+LONGEST_WAIT = 200
 
 
 class ControlStep(NamedTuple):
@@ -34,12 +36,10 @@ class ControlStep(NamedTuple):
 class AdaptiveController:
     """Learns the backlash from v and y and publishes v = BI(u_d), section 3 of the paper.
 
-    Call `step` once per received y, and `refine` when v is on its way.
-
-    compensating: False inverts the slope alone, as if there were no gap. motion: of the newest
-    command. redesigns: whether the structure is designed anew for the better models of G that the
-    estimator proposes. serial: the motor and G as the structure sees them; None where v is what it
-    commands. executor: where it is designed, None for here.
+    Call `step` once per received y, and `refine` when v is on its way. compensating: False inverts
+    the slope alone. motion: of the newest command. redesign: whether the structure is designed anew
+    for the better models of G that the estimator proposes, by the executor. serial: the motor and G
+    as the structure sees them; None where v is what it commands.
     """
 
     def __init__(
@@ -50,8 +50,7 @@ class AdaptiveController:
         self.estimator, self.structure = estimator, structure
         self.inverse, self.limits = inverse, limits
         self.motion = at_rest(inverse.v)
-        self.compensating = True
-        self.lost_samples = 0
+        self.compensating, self.lost_samples = True, 0
         self.redesign = Redesign(executor or Executor()) if redesign else None
         self._serial = serial
         self._interval: Interval | None = None  # that which began with the newest command
@@ -60,45 +59,57 @@ class AdaptiveController:
         self, y: float, y_m: float, lost: int = 0, applied: Sequence[float] = (),
         alternatives: Sequence[float] = (), commands: Sequence[float] = (),
     ) -> ControlStep:
-        """Learn from y(k), and return the command for sample k.
+        """Learn from y(k), and return the command for sample k, within the limits.
 
-        y, y_m: output and reference, finite. lost: samples >= 0 that never arrived since the last
-        call; the plant went on with the last v through all of them. applied: the v that was
-        really applied in each of the lost + 1 intervals since then, if it is known. commands: those
-        that acted in them, if it is not the last one. alternatives: commands that may have acted
-        instead, nan where none may.
+        lost: samples that never arrived since the last call; the plant went on with the last v
+        through them. Of each of the lost + 1 intervals since then, if it is known: applied, the v
+        that was really applied; commands, those that acted if it is not the last one; alternatives,
+        those that may have acted instead, nan where none may.
         """
         if not all(map(plausible, (y, y_m, *applied, *commands))):
             raise ValueError(
                 f'y={y!r}, y_m={y_m!r}, applied={applied!r} and commands={commands!r} must be '
                 f'finite and no larger than {LARGEST_SIGNAL:g}'
             )
+        serial, inverse = self._serial, self.inverse
         if self._interval is not None:
+            self.lost_samples += lost
             for i in range(lost + 1):
-                interval = self._interval
+                heard, interval = y if i == lost else None, self._interval
                 if commands:
                     interval = interval._replace(v=commands[i])
-                if alternatives and not applied:
+                v = applied[i] if applied else None
+                if serial is not None:
+                    v = serial.update(heard, interval.v, v, self.estimator.estimate)
+                elif alternatives and not applied:
                     interval = interval._replace(other=alternatives[i])
-                self._learn(y if i == lost else None, interval, applied[i] if applied else None)
-            self.lost_samples += lost
-        return self._control(y, y_m)
+                if v is not None:
+                    interval = interval._replace(v=v)
+                self.estimator.update(heard, interval)
+        used = estimate = self.estimator.estimate
+        if not self.compensating:
+            used = replace(estimate, c_r=0.0, c_l=0.0)
+        elif serial is not None:
+            used = serial.for_command(estimate)
+        gap = used.c_r - used.c_l
+        crossing = max(inverse.samples_across(gap), self.limits.samples_across(gap))
+        inputs = ControlInput(y_m, y, used, self._source, crossing)
+        u_d, v, f = self.structure.control(inputs, inverse)
+        self.motion = self.limits.apply(v, self.motion)
+        inverse.applied(self.motion.v)
+        self._interval = Interval(self.motion.v, y_m, u_d, f)
+        return ControlStep(y_m, y, u_d, self.motion.v, estimate)
 
     def refine(self) -> None:
         """Do what the command did not have to wait for; who has no time for it leaves it out."""
         self.structure.prepare()
         self.estimator.refine()
-        if self.redesign is None:
-            return
-        design = self.redesign.due(self.estimator.proposal, self.structure, self._serial)
-        if design is not None:
+        redesign = self.redesign
+        if redesign and redesign.due(self.estimator.proposal, self.structure, self._serial):
             # At once and together: x_hat and gains of two models do not fit each other.
-            self.estimator.adopt(design.model)
-            self.redesign.adopted = design.model
-            if self._serial is not None:
-                self._serial.adopt(design.commanded)
-            if design.gains is not None:
-                self.structure.adopt(design.gains, self._source)
+            self._adopt(redesign, redesign.considered)
+            if redesign.gains is not None:
+                self.structure.adopt(redesign.gains, self._source)
 
     def command_of(self, v: float) -> float:
         """The command at which the motor rests at a v that was reported."""
@@ -120,50 +131,74 @@ class AdaptiveController:
         self.motion = before.motion
         if self.redesign is not None and before.redesign is not None:
             self.redesign.considered = before.redesign.considered
-            adopted = self.redesign.adopted = before.redesign.adopted
-            if adopted is not None:
-                self.estimator.adopt(adopted)
-                if self._serial is not None:
-                    self._serial.adopt(self._serial.before(adopted))
+            self._adopt(self.redesign, before.redesign.adopted)
         self.structure.go_on_from(before.structure, state_known=False)
 
     def close(self) -> None:
         """Give back what estimator and designs hold elsewhere."""
         self.estimator.close()
-        if self.redesign is not None:
-            self.redesign.close()
+        if self.redesign is not None and self.redesign.channel is not None:
+            self.redesign.channel.close()
+
+    def _adopt(self, redesign: Redesign, model: StateModel | None) -> None:
+        redesign.adopted = model
+        if model is not None:
+            self.estimator.adopt(model)
+            if self._serial is not None:
+                self._serial.adopt(self._serial.before(model))
 
     @property
     def _source(self) -> StateSource:
-        """Who knows the state of what the structure commands."""
         return self.estimator if self._serial is None else self._serial
 
-    def _learn(self, y: float | None, interval: Interval, applied: float | None) -> None:
-        """Take in y(k), None if it was lost; applied: v of the interval as it was reported."""
-        serial, estimate = self._serial, self.estimator.estimate
-        if serial is not None:
-            # Where nothing is reported the motor is where the command takes it.
-            position = serial.position(interval.v, estimate)
-            applied = position if applied is None else applied
-            serial.update(y, interval.v, applied, estimate)
-            interval = interval._replace(other=nan)
-        if applied is not None:
-            interval = interval._replace(v=applied)
-        self.estimator.update(y, interval)
 
-    def _control(self, y: float, y_m: float) -> ControlStep:
-        """The command for this sample, within the limits."""
-        inverse, estimate = self.inverse, self.estimator.estimate
-        used = estimate
-        if not self.compensating:
-            used = replace(estimate, c_r=0.0, c_l=0.0)
-        elif self._serial is not None:
-            used = self._serial.for_command(estimate)
-        gap = used.c_r - used.c_l
-        crossing = max(inverse.samples_across(gap), self.limits.samples_across(gap))
-        inputs = ControlInput(y_m, y, used, self._source, crossing)
-        u_d, v, f = self.structure.control(inputs, inverse)
-        self.motion = self.limits.apply(v, self.motion)
-        inverse.applied(self.motion.v)
-        self._interval = Interval(self.motion.v, y_m, u_d, f)
-        return ControlStep(y_m, y, u_d, self.motion.v, estimate)
+@dataclass
+class Redesign:
+    """Has gains made for the better models of G that the estimator proposes, one at a time.
+
+    adopted: the learned G that is in use. considered: the proposal that was designed for last.
+    gains: for it, None for the present ones. failed: designs without a result. channel: where they
+    are made, from the first one on.
+    """
+
+    executor: Executor
+    adopted: StateModel | None = None
+    considered: StateModel | None = None
+    gains: object | None = None
+    failed: int = 0
+    channel: Channel | None = None
+    _made: bool = False
+    _waited: int = 0  # samples for which gains that are made could not take over
+
+    def due(
+        self, proposal: StateModel | None, structure: ControlStructure, serial: SerialPlant | None,
+    ) -> bool:
+        """Whether the design for `considered` takes over now. proposal: the newest G."""
+        busy = self.channel is not None and self.channel.busy
+        if proposal is not None and proposal is not self.considered and not busy:
+            self.considered, self.gains, self._waited = proposal, None, 0
+            job = structure.redesign(proposal if serial is None else serial.before(proposal))
+            self._made = job is None
+            if job is not None:
+                self.channel = self.channel or self.executor.open()
+                self.channel.submit(_designed, job)
+        if self.channel is not None and self.channel.busy:
+            found = self.channel.poll()
+            if isinstance(found, Failure) and found.kind == LOST:
+                self.considered = None  # the same again, by another worker
+            elif isinstance(found, Failure):
+                self.failed += 1
+            elif found is not None and found[0] is not None:
+                self.gains, self._made = found[0], True
+        if not self._made:
+            return False
+        self._waited += 1
+        if not structure.may_change and self._waited <= LONGEST_WAIT:
+            return False
+        self._made = False
+        return True
+
+
+def _designed(make: Callable[[], object | None]) -> tuple[object | None]:
+    """Gains, or None where the present ones are safer, as a result that is never None."""
+    return make(),

@@ -9,17 +9,13 @@ from backlash_ros.core.plant.backlash import Region, clamp
 
 
 class BacklashInverse:
-    """v = BI(u_d): crosses the gap whenever u_d turns, equations (2.2) and (2.3).
-
-    With the true m, c_r, c_l this is the exact inverse (2.2); with estimates, which may differ
-    from call to call, the adaptive inverse (2.3).
+    """v = BI(u_d): crosses the gap whenever u_d turns; exact (2.2) with the true m, c_r, c_l.
 
     direction_band: u_d has turned only when it came back from its extreme by more than this
         [unit of u_d]; until then v is held. 0 is the printed inverse.
     take_up: largest move of v per sample while the gap is crossed (2.3: "a line segment with a
         finite slope"), and over to a line that new estimates have moved by more than that, until
-        u moves or, after slow_down, until it is there [unit of v]; inf jumps. From there on v goes
-        as far as u_d does.
+        u moves or, after slow_down, until it is there [unit of v]; inf jumps.
     side: line in use; GAP until u_d moves for the first time. extreme: furthest u_d in the present
         direction. taking_up: whether v is still on its way to the line. limited: whether the last
         v could not be applied as it was.
@@ -47,10 +43,7 @@ class BacklashInverse:
     def step(
         self, u_d: float, m: float, c_r: float, c_l: float, band: float | None = None,
     ) -> float:
-        """Return v(t) for u_d(t) and the parameters in use, equation (2.3).
-
-        band: instead of direction_band.
-        """
+        """Return v(t) for u_d(t) and the parameters in use (2.3); band: not direction_band."""
         if band is None:
             band = self.direction_band
         side = self.direction(u_d, band)
@@ -82,7 +75,8 @@ class BacklashInverse:
         elif not self.taking_up and (u_d - self.extreme) * side <= 0.0:
             return self.v
         self.extreme = u_d if (u_d - self._u) * side > 0.0 else self._u
-        return self._approach(m, c_r, c_l)
+        self.taking_up = True
+        return self.proceed(m, c_r, c_l)
 
     def aim(self, u_d: float, side: Region) -> None:
         """Let the next step go to u_d on the line of this side, whatever it came from."""
@@ -91,30 +85,36 @@ class BacklashInverse:
         self.side, self.extreme, self.taking_up = side, u_d, True
 
     def proceed(self, m: float, c_r: float, c_l: float) -> float:
-        """Return v on its way to where `aim` says; else it stays."""
-        return self._approach(m, c_r, c_l) if self.taking_up else self.v
+        """Return v, on its way to the line no faster than the gap is crossed until it moves u."""
+        if not self.taking_up:
+            return self.v
+        crossing = c_r if self.side is Region.RIGHT else c_l
+        # Where v begins to move u, or would have stood if these parameters had been in use before.
+        way = (self.extreme if self._slowed else self._u) / m + crossing - self.v
+        if abs(way) > self.take_up:
+            self.v += self.take_up if way > 0.0 else -self.take_up
+        else:
+            self.v = self.extreme / m + crossing
+            self.taking_up = self._slowed = False
+        self._play = m, c_r, c_l
+        return self.v
 
     def slow_down(self) -> None:
         """Let v go on to where u_d wants it like it crosses the gap, until it is there."""
         self.taking_up = self._slowed = True
 
     def resume(self, m: float, c_r: float, c_l: float) -> float:
-        """Return the u_d with which v stays where it is, for these parameters from now on.
-
-        Other parameters have moved the line that is engaged: on the new one, v stands for another
-        u than on the one that has led it there.
-        """
+        """Return the u_d with which v stays where it is, for these parameters from now on."""
         if self.side is not Region.GAP and self._play != (m, c_r, c_l):
-            self.extreme = m * (self.v - (c_r if self.side is Region.RIGHT else c_l))
-            self.taking_up = self._slowed = False
             self._play = m, c_r, c_l
+            self.extreme = self._u_at(self.v)
+            self.taking_up = self._slowed = False
         return self.extreme
 
     def start_from(self, v: float) -> None:
         """Say which v acts before the next step, whatever was sent."""
         if v != self.v and self.side is not Region.GAP:
-            m, c_r, c_l = self._play
-            self.extreme = m * (v - (c_r if self.side is Region.RIGHT else c_l))
+            self.extreme = self._u_at(v)
         self.v = v
 
     def applied(self, v: float) -> None:
@@ -133,20 +133,9 @@ class BacklashInverse:
         """Samples that v takes across a gap of this width."""
         return distance / self.take_up if self.take_up < inf else 0.0
 
-    def _approach(self, m: float, c_r: float, c_l: float) -> float:
-        """Go to the line in use, no faster than the gap is crossed until v moves u."""
-        crossing = c_r if self.side is Region.RIGHT else c_l
-        # Where v begins to move u, or would have stood if these parameters had been in use before.
-        until = self.extreme if self._slowed else self._u
-        way = until / m + crossing - self.v
-        if abs(way) > self.take_up:
-            self.v += self.take_up if way > 0.0 else -self.take_up
-            self.taking_up = True
-        else:
-            self.v = self.extreme / m + crossing
-            self.taking_up = self._slowed = False
-        self._play = m, c_r, c_l
-        return self.v
+    def _u_at(self, v: float) -> float:
+        m, c_r, c_l = self._play
+        return m * (v - (c_r if self.side is Region.RIGHT else c_l))
 
     def _note_on_the_way(self) -> None:
         """Note what v has made of u since it left for its line."""

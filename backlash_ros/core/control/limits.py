@@ -18,10 +18,9 @@ def plausible(value: float) -> bool:
 
 
 class Motion(NamedTuple):
-    """A command and how it moves.
+    """A command and how it moves, in the unit of v.
 
-    v: the command. move: v(k) - v(k-1). target: the v that was asked for. pace: the move of the
-    target. All in the unit of v.
+    move: v(k) - v(k-1). target: the v that was asked for. pace: the move of the target.
     """
 
     v: float
@@ -59,9 +58,8 @@ class Limits:
         Whatever they tell leads no command out of the bounds, or further out than known is: the v
         that acted before, None where nobody knows it. The bounds may have been narrowed since.
         """
-        low, high = self.low, self.high
-        if known is not None:
-            low, high = min(low, known), max(high, known)
+        low, high = (self.low, self.high) if known is None else (
+            min(self.low, known), max(self.high, known))
         return min(max(told, low), high)
 
     def apply(self, v: float, before: Motion) -> Motion:
@@ -71,32 +69,13 @@ class Limits:
         it is when what is asked for is no number. With a finite acceleration v brakes in time for
         the bounds and for the target, and joins a target that moves steadily without a lag.
         """
-        if isnan(v):
-            v = before.v
         # Beyond the largest measurement nobody could tell what v does.
-        target = min(max(v, self.low, -LARGEST_SIGNAL), self.high, LARGEST_SIGNAL)
-        if self.acceleration == inf:
-            sent = min(max(target, before.v - self.move), before.v + self.move)
-            return Motion(sent, sent - before.v, target)
-        return self._accelerated(target, before)
-
-    def stop(self, before: Motion) -> Motion:
-        """The next motion on the shortest way to rest."""
-        if self.acceleration == inf or before.move == 0.0:
-            return at_rest(before.v)
-        less = max(abs(before.move) - self.acceleration, 0.0)
-        move = less if before.move > 0.0 else -less
-        return Motion(before.v + move, move, before.v + move)
-
-    def samples_across(self, distance: float) -> float:
-        """Samples that a move of v over a distance >= 0 takes from rest to rest."""
-        if self.acceleration == inf:
-            return distance / self.move if self.move < inf else 0.0
-        fastest = min(self.move, sqrt(distance * self.acceleration))
-        return distance / fastest + fastest / self.acceleration if fastest > 0.0 else 0.0
-
-    def _accelerated(self, target: float, before: Motion) -> Motion:
+        target = min(max(before.v if isnan(v) else v, self.low, -LARGEST_SIGNAL), self.high,
+                     LARGEST_SIGNAL)
         v, most = before.v, self.acceleration
+        if most == inf:
+            sent = min(max(target, v - self.move), v + self.move)
+            return Motion(sent, sent - v, target)
         asked = pace = target - before.target
         if abs(pace) > self.move or abs(pace - before.pace) > most:
             pace = 0.0  # a jump is no motion that v could join
@@ -112,6 +91,21 @@ class Limits:
         if abs(sent - target) <= 1e-14 * (abs(v) + abs(target)):
             sent = target
         return Motion(sent, move, target, asked)
+
+    def stop(self, before: Motion) -> Motion:
+        """The next motion on the shortest way to rest."""
+        if self.acceleration == inf or before.move == 0.0:
+            return at_rest(before.v)
+        less = max(abs(before.move) - self.acceleration, 0.0)
+        move = less if before.move > 0.0 else -less
+        return Motion(before.v + move, move, before.v + move)
+
+    def samples_across(self, distance: float) -> float:
+        """Samples that a move of v over a distance >= 0 takes from rest to rest."""
+        if self.acceleration == inf:
+            return distance / self.move if self.move < inf else 0.0
+        fastest = min(self.move, sqrt(distance * self.acceleration))
+        return distance / fastest + fastest / self.acceleration if fastest > 0.0 else 0.0
 
     def _most_towards(self, distance: float) -> float:
         """The largest move towards a bound; < 0 beyond it, as after bounds were narrowed."""
@@ -155,6 +149,5 @@ def check_last_commands(p: Parameters) -> None:
     """Raise ParameterError for a ramp without a slope."""
     for name in ('on_stop', 'on_timeout'):
         if p[name] == 'ramp' and p.control.rate_max == inf:
-            raise ParameterError(
-                name, 'ramp', 'needs a finite control.rate_max', 'set it, or take hold or zero'
-            )
+            raise ParameterError(name, 'ramp', 'needs a finite control.rate_max',
+                                 'set it, or take hold or zero')

@@ -1,13 +1,20 @@
-"""The paper's structure u_d = y_m + f v, equation (3.2), with its algebraic loop solved."""
+"""The structures of the papers: u_d = y_m + f v (3.2), and the four blocks of Tao and Kokotović."""
 
 from __future__ import annotations
 
 from math import hypot, inf
 
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.control import protocol
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.protocol import Command, ControlInput, ControlStructure
-from backlash_ros.core.estimate import Estimate
+from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.plant.backlash import Region
+from backlash_ros.core.plant.numerics import FourBlocks
+
+Array = NDArray[np.float64]
 
 # (m - f) divides: f beyond this share of m would multiply every error in m by more than five.
 LARGEST_F_OVER_M = 0.8
@@ -16,16 +23,14 @@ LARGEST_F_OVER_M = 0.8
 class Proportional(ControlStructure):
     """u_d = y_m + f v (3.2) with v = BI(u_d) (2.3): each needs the other.
 
-    On the branch with crossing c the loop has one solution, u_d = m (y_m + f c) / (m - f).
-    The branch counts when the direction of u_d agrees with it. m = f is singular: f is limited
-    to 0.8 m.
+    On the branch with crossing c the loop has one solution, u_d = m (y_m + f c) / (m - f). The
+    branch counts when the direction of u_d agrees with it. m = f is singular: f is limited.
     """
 
     def __init__(self) -> None:
         self._estimate: Estimate | None = None  # that v was made with
 
     def go_on_from(self, other: ControlStructure, state_known: bool = True) -> None:
-        """Take over what the present v was made with."""
         if isinstance(other, Proportional):
             self._estimate = other._estimate
 
@@ -45,8 +50,7 @@ class Proportional(ControlStructure):
         if f == 0.0:  # nothing to solve
             return Command(y_m, inverse.step(y_m, m, c_r, c_l), f)
         if e.learned:  # turns of u_d by less than three of its standard deviations are noise
-            by_m = f * (y_m + f * c_r) / (m - f) ** 2
-            by_c = m * f / (m - f)
+            by_m, by_c = f * (y_m + f * c_r) / (m - f) ** 2, m * f / (m - f)
             band = max(band, 3.0 * hypot(by_m * e.std_m, by_c * max(e.std_c_r, e.std_c_l)))
         right, left = m * (y_m + f * c_r) / (m - f), m * (y_m + f * c_l) / (m - f)
         # Where both directions solve the loop, the smaller move is the one a shaft would make.
@@ -82,3 +86,48 @@ def _on_the_line(y_m: float, e: Estimate, side: Region) -> float:
     """v on the line of a side."""
     c = e.c_r if side is Region.RIGHT else e.c_l
     return c + (y_m + e.f * c) / (e.m - min(e.f, LARGEST_F_OVER_M * e.m))
+
+
+class PolePlacement(ControlStructure):
+    """u_d from the four blocks (numerics.py), v = BI(u_d); the gains stay those of a nominal G.
+
+    delay: what B/A_m delays a slow reference by, rounded to samples.
+    """
+
+    def __init__(self, blocks: FourBlocks) -> None:
+        self._blocks = blocks
+        size = len(blocks.filter) - 1
+        self._companion = np.eye(size, k=-1)
+        self._companion[:1] = -blocks.filter[1:]
+        self._w: Array = np.zeros((2, size))  # of u_d and of y
+        # r and what it asks for, newest first.
+        self._r: Array = np.zeros(len(blocks.demand[0]))
+        self._asked: Array = np.zeros(len(blocks.demand[1]) - 1)
+        self._largest_asked = 0.0  # largest of it so far
+        b, a = blocks.reference.numerator, blocks.reference.denominator
+        self.delay = round(float(  # the group delay at z = 1
+            np.polyval(np.polyder(a), 1.0) / a.sum() - np.polyval(np.polyder(b), 1.0) / b.sum()))
+
+    def go_on_from(self, other: ControlStructure, state_known: bool = True) -> None:
+        if isinstance(other, PolePlacement) and other._w.shape == self._w.shape:
+            self._w = other._w
+            self._r, self._asked, self._largest_asked = other._r, other._asked, other._largest_asked
+
+    def control(self, inputs: ControlInput, inverse: BacklashInverse) -> Command:
+        """Return u_d, no further than feedback may go from what r asks for, and v = BI(u_d)."""
+        blocks, e, (w_1, w_2) = self._blocks, inputs.estimate, self._w
+        u_d = float(blocks.theta_1 @ w_1 + blocks.theta_2 @ w_2)
+        u_d += blocks.theta_20 * inputs.y + blocks.theta_3 * inputs.y_m
+        numerator, denominator = blocks.demand
+        self._r = np.append(inputs.y_m, self._r[:-1])
+        asked = float(numerator @ self._r - denominator[1:] @ self._asked)
+        self._asked = np.append(asked, self._asked)[:-1]
+        self._largest_asked = max(self._largest_asked, abs(asked))
+        share = protocol.LARGEST_FEEDBACK if e.status is Status.TRACKING else \
+            protocol.LARGEST_IN_ACQUISITION
+        reach = share * max(self._largest_asked, e.m * (e.c_r - e.c_l))
+        u_d = min(max(u_d, asked - reach), asked + reach)
+        v = inverse.step(u_d, e.m, e.c_r, e.c_l)
+        self._w = np.array([self._companion @ w_1, self._companion @ w_2])
+        self._w[:, :1] += [[u_d], [inputs.y]]
+        return Command(u_d, v, 0.0)

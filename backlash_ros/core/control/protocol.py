@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from operator import mul
+from collections.abc import Callable
 from typing import NamedTuple
 
 from backlash_ros.core.control.inverse import BacklashInverse
@@ -18,10 +17,7 @@ LARGEST_IN_ACQUISITION, LARGEST_FEEDBACK = 10.0, 100.0
 
 
 class ControlInput(NamedTuple):
-    """What is known at a sample: reference, output, estimate, and who knows the state of G.
-
-    crossing: samples that v takes across the gap, by its limits.
-    """
+    """What is known at a sample. crossing: samples that v takes across the gap, by its limits."""
 
     y_m: float
     y: float
@@ -38,12 +34,6 @@ class Command(NamedTuple):
     f: float
 
 
-def dot(a: Sequence[float], b: Sequence[float]) -> float:
-    """Inner product of two states: beside so few numbers a call of NumPy takes longer."""
-    product: float = sum(map(mul, a, b))
-    return product
-
-
 class ControlStructure:
     """Makes u_d from the reference and drives the inverse with it.
 
@@ -55,7 +45,6 @@ class ControlStructure:
 
     @property
     def may_change(self) -> bool:
-        """See above."""
         return True
 
     def control(self, inputs: ControlInput, inverse: BacklashInverse) -> Command:
@@ -68,8 +57,8 @@ class ControlStructure:
     def redesign(self, model: StateModel) -> Callable[[], object | None] | None:
         """What makes the gains for a better G, for `adopt`; None where there are none to make.
 
-        It depends on nothing but what it holds, so that it can be called in another process. It
-        returns None where the result would be less safe than what is in use.
+        It can be called in another process, and returns None where the result would be less safe
+        than what is in use.
         """
         return None
 

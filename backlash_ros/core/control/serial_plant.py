@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import replace
-from math import nan
+from math import isnan, nan
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,8 +36,7 @@ class SerialPlant:
     """
 
     def __init__(self, actuator: Actuator, model: StateModel, noise_std: float) -> None:
-        self._actuator, self._noise_std = actuator, noise_std
-        self._motor = Motor(actuator)
+        self._actuator, self._noise_std, self._motor = actuator, noise_std, Motor(actuator)
         self._play = self._commanded = nan  # what the gap holds, in units of v and of the command
         self._learned = False
         # u and y, from which a new observer finds the state.
@@ -50,19 +49,17 @@ class SerialPlant:
 
     def adopt(self, model: StateModel) -> None:
         """Give x_hat for this L G from now on."""
-        self.model = model
+        self._model = model
         # It is told u: to the observer there is no backlash.
-        self._observer = FixedBacklash(
-            Estimate(1.0, 0.0, 0.0, 0.0), model, self._noise_std,
-            LITTLE_DOUBT if self._learned else DOUBT,
-        )
+        self._observer = FixedBacklash(Estimate(1.0, 0.0, 0.0, 0.0), model, self._noise_std,
+                                       LITTLE_DOUBT if self._learned else DOUBT)
         self._variance, self._taken, self._refused = 0.0, 0, 0
         for u, y in self._newest:
             self._follow(y, u)
 
     @property
     def x_hat(self) -> Array:
-        """State of L G in the coordinates of `model`, shape (n,)."""
+        """State of L G in the coordinates of its model, shape (n,)."""
         return self._observer.x_hat
 
     @property
@@ -79,35 +76,37 @@ class SerialPlant:
         """The command at which the motor rests at v."""
         return v / self._actuator.gain
 
-    def position(self, command: float, estimate: Estimate) -> float:
-        """Where the motor is at the end of an interval by the command of it; once per interval."""
-        c_r, c_l = estimate.c_r, estimate.c_l
-        play = self._play if self._play == self._play else command * self._actuator.gain + c_r
-        return self._motor.step(command, play - c_r, c_r, c_l)
+    def update(
+        self, y: float | None, command: float, applied: float | None, estimate: Estimate,
+    ) -> float:
+        """Take in y(k), None if it was lost, and the command of the interval before it.
 
-    def update(self, y: float | None, command: float, v: float, estimate: Estimate) -> None:
-        """Take in y(k), None if it was lost, and command and v of the interval before it."""
+        Returns its v: as it was reported, else where the command takes the motor.
+        """
+        c_r, c_l = estimate.c_r, estimate.c_l
+        play = command * self._actuator.gain + c_r if isnan(self._play) else self._play
+        position = self._motor.step(command, play - c_r, c_r, c_l)
+        v = position if applied is None else applied
         self._play = _played(self._play, v, estimate)
         # Nothing is known of the gap before it was learned.
-        gapless = replace(estimate, c_r=0.0, c_l=0.0)
-        seen = self.for_command(estimate if estimate.learned else gapless)
+        seen = self.for_command(
+            estimate if estimate.learned else replace(estimate, c_r=0.0, c_l=0.0))
         self._commanded = _played(self._commanded, command, seen)
         if estimate.learned is not self._learned:
             self._learned = estimate.learned
-            self.adopt(self.model)
+            self.adopt(self._model)
         u = seen.m * (self._commanded - seen.c_r)
         self._newest.append((u, y))
         self._follow(y, u)
+        return v
 
     def _follow(self, y: float | None, u: float) -> None:
-        # innovations, of whose rms y may differ: they come in bursts, when v crosses
-        averaged = 100
+        averaged = 100  # innovations, of whose rms y may differ: they come in bursts at crossings
         observer = self._observer
-        ahead = observer.predicted(u)
         if y is not None and self._taken >= averaged:
             least = max(self._variance, self._noise_std**2)
             # So many outliers in a row are none.
-            if (y - ahead) ** 2 > 100.0**2 * least and self._refused < OUTLIERS:
+            if (y - observer.predicted(u)) ** 2 > 100.0**2 * least and self._refused < OUTLIERS:
                 self._refused += 1
                 y = None
         observer.update(y, Interval(u, nan, nan, nan))
@@ -121,4 +120,4 @@ class SerialPlant:
 def _played(held: float, v: float, estimate: Estimate) -> float:
     """What the gap holds at v; in its middle where nothing is known of before."""
     gap = estimate.c_r - estimate.c_l
-    return clamp(v + 0.5 * gap if held != held else held, v, v + gap)
+    return clamp(v + 0.5 * gap if isnan(held) else held, v, v + gap)

@@ -53,35 +53,33 @@ class ReferenceSignal:
         return self._samples[min(index, len(self._samples) - 1)]
 
 
-def read_reference_file(parameters: Parameters) -> tuple[float, ...]:
+def read_reference_file(p: Parameters) -> tuple[float, ...]:
     """Values of the CSV with the header t,y_m and a row per sample period, from t = 0 on.
 
     Empty for any other waveform. Raises ParameterError, naming the line.
     """
-    if parameters.waveform != 'file':
+    if p.waveform != 'file':
         return ()
-    name, period = parameters.file, parameters.sample_period
-    if not name:
+    if not p.file:
         raise ParameterError('file', '', 'must name a CSV with rows t,y_m for waveform: file')
     try:
-        with Path(name).open(newline='', encoding='utf-8') as file:
+        with Path(p.file).open(newline='', encoding='utf-8') as file:
             header, *rows = list(csv.reader(file)) or [[]]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ParameterError('file', name, f'cannot be read: {error}') from None
+        raise ParameterError('file', p.file, f'cannot be read: {error}') from None
     if [cell.strip() for cell in header] != ['t', 'y_m']:
-        raise ParameterError('file', name, 'must begin with the header t,y_m')
+        raise ParameterError('file', p.file, 'must begin with the header t,y_m')
     samples: list[float] = []
     for line, row in enumerate(rows, start=2):
         try:
-            t, y_m = (float(cell) for cell in row)
+            t, y_m = map(float, row)
         except ValueError:
-            raise ParameterError('file', name, f'line {line} must hold t,y_m') from None
-        due = len(samples) * period
+            raise ParameterError('file', p.file, f'line {line} must hold t,y_m') from None
+        due = len(samples) * p.sample_period
         # A file in decimals rounds a little away.
-        if not (abs(t - due) <= 1e-3 * period and isfinite(y_m)):
+        if not (abs(t - due) <= 1e-3 * p.sample_period and isfinite(y_m)):
             raise ParameterError(
-                'file', name, f'line {line} must hold t={due:.9g} and a finite y_m',
-                f'one row per sample_period={period!r}',
-            )
+                'file', p.file, f'line {line} must hold t={due:.9g} and a finite y_m',
+                f'one row per sample_period={p.sample_period!r}')
         samples.append(y_m)
     return tuple(samples)

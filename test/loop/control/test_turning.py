@@ -155,7 +155,7 @@ def test_a_deviation_that_noise_explains_is_left_alone() -> None:
     feedback.trust = Trust(held_for=TRUSTED_AFTER)
     feedback.prepare(np.zeros((2, 2)), 1e-3)
     assert feedback.u([3e-3, 0.0], held_back=False, largest=1.0)[0] == 0.0
-    full = SLOW.feedback.gain[0]
+    full = SLOW.feedback.state[0]
     beyond = feedback.u([1e-2, 0.0], held_back=False, largest=1.0)[0]
     assert beyond == pytest.approx(full * (1e-2 - 3.5e-3))
 

@@ -1,18 +1,20 @@
-"""From G to the gains of the tracking structure: a pure function, fit for another process."""
+"""From G to the gains of the tracking structure: pure functions, fit for another process."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from math import hypot
+from operator import mul
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.control.tracking.lq_preview import PreviewGains, preview_gains
-from backlash_ros.core.control.tracking.margin import Feedback, modulus_margin, tolerates
 from backlash_ros.core.control.tracking.reference_window import averages
 from backlash_ros.core.parameters import ParameterError
+from backlash_ros.core.plant.numerics import riccati
 from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction, powers
 
 Array = NDArray[np.float64]
@@ -29,14 +31,13 @@ SOFTER = (1.0, 1e2, 1e4)
 SAFER = (1.0, *np.geomspace(1.1, 100.0, 60).tolist())
 HORIZON = 300  # samples within which a wrong u must matter, and u* answers to a reference
 LOOK_AHEAD = 20  # samples, at most, for which u* is known ahead
+# Variance of the disturbance per sample, seen in y, over that of the noise on y: from an observer
+# that believes its model to one that believes y alone.
+CONFIDENCES = (1e-4, 1e-1, 1e2, 1e5)
 
 
-@dataclass(frozen=True)
-class Weights:
-    """What the gains minimise, see `preview_gains`.
-
-    input_weight: rho / |G|^2 at a twentieth of the sampling rate. preview: N [samples].
-    """
+class Weights(NamedTuple):
+    """input_weight: rho / |G|^2 at a twentieth of the sampling rate. preview: N [samples]."""
 
     input_weight: float
     integral_weight: float
@@ -47,35 +48,32 @@ class Weights:
 class Plan:
     """One ideal trajectory.
 
-    states (L, n + 1), references (L, N + 1): u* of the next L samples, of [x*; q*] and the
-    references. noise_gains: see ReferenceWindow. x_noise: covariance (n, n) of x* for noise of 1 in
-    references, for each of their averages.
+    closed: transition of z = [x*; q*], (n + 1, n + 1). states (L, n + 1), references (L, N + 1): u*
+    of the next L samples, of z and the references. noise_gains: see ReferenceWindow. x_noise:
+    covariance (n, n) of x* for noise of 1 in references, for each of their averages.
     """
 
     gains: PreviewGains
+    closed: Array
     states: Array
     references: Array
     noise_gains: Array
     x_noise: tuple[Array, ...]
 
-    def replayed(
-        self, model: StateModel, references: Array, history: int,
-    ) -> tuple[list[float], float]:
+    def replayed(self, model: StateModel, references: Array) -> tuple[list[float], float]:
         """x* and q* at the sample of the newest window, from rest at the oldest reference.
 
-        With z = [x*; q*] and u_p = -sum f_j r(k+j) it is z(k+1) = F z(k) + [B; 0] u_p + [0; 1] r.
-        history: for how many samples at most.
+        z(k+1) = F z(k) + [B; 0] u_p + [0; 1] r with u_p = -sum f_j r(k+j).
         """
-        n, closed = model.order, _closed(model, self.gains)
+        n = model.order
         inputs = np.zeros((n + 1, 2))
         inputs[:n, 0], inputs[n, 1] = model.b, 1.0
         by_preview = -np.convolve(references, self.gains.preview[::-1], 'valid')
         steps = len(by_preview) - 1  # the newest one makes the next state
         start = np.append(model.equilibrium * references[0], 0.0)
-        z = np.linalg.matrix_power(closed, steps) @ start
         pairs = np.column_stack([by_preview[:steps], references[:steps]])[::-1]
-        responses = powers(closed, inputs, max(history, steps))
-        z = z + np.einsum('kij,kj->i', responses[:steps], pairs)
+        z = np.linalg.matrix_power(self.closed, steps) @ start + np.einsum(
+            'kij,kj->i', powers(self.closed, inputs, steps), pairs)
         return z[:n].tolist(), float(z[n])
 
 
@@ -83,17 +81,15 @@ class Plan:
 class TrackingDesign:
     """Gains of one model of G.
 
-    plans: ideal trajectories, each with more weight of u than the one before, for references with
-    noise. feedback: of the deviations from them. schedule: gains (n,), that of full feedback first,
-    each with less than the one before: see SCHEDULE; where v meets its limits full feedback would
-    cycle between them. acquisition: gain (n,) while the backlash is unknown; None where no feedback
-    is better. gentle: gain (n,) that leads y back while the reference rests. push: |x| after
-    HORIZON samples of u = 1; push_ahead: |y| after LOOK_AHEAD.
+    plans: ideal trajectories, each weighing u more than the one before, for references with noise.
+    feedback: of the deviations from them. schedule: gains (n,), that of full feedback first.
+    acquisition: gain (n,) while the backlash is unknown; None where no feedback is better. gentle:
+    gain (n,) at rest. push: |x| after HORIZON samples of u = 1. push_ahead: |y| after LOOK_AHEAD.
     """
 
     model: StateModel
     plans: tuple[Plan, ...]
-    feedback: Feedback
+    feedback: PreviewGains
     schedule: tuple[Gain, ...]
     acquisition: Gain | None
     gentle: Gain
@@ -112,8 +108,8 @@ class TrackingDesign:
         Held for j samples from x - x* = e on, u is what u*(k+j) - K (x - x*) asks for then:
         (1 + sum_i K A^i B) u = u*(k+j) + sum_i K A^(j-1-i) B u*(k+i) - K A^j e,  i = 0 .. j - 1
         """
-        length = len(self.plans[0].states)
-        rows = powers(self.model.a, np.eye(self.model.order), length)
+        n, length = self.model.order, len(self.plans[0].states)
+        rows = powers(self.model.a, np.eye(n), length)
         held = []
         for gain in self.schedule:
             by_state = np.array(gain) @ rows
@@ -124,39 +120,33 @@ class TrackingDesign:
             share = by_u.sum(axis=1)
             count = int(np.cumprod(share > 0.0).sum())  # beyond, it asks for more the more u is
             by_both = np.column_stack([-by_state[1:], by_u])[:count] / share[:count, None]
-            held.append((by_both[:, :self.model.order], by_both[:, self.model.order:]))
+            held.append((by_both[:, :n], by_both[:, n:]))
         return tuple(held)
-
-    @cached_property
-    def schedule_sizes(self) -> list[float]:
-        """|K| of each."""
-        return [hypot(*gain) for gain in self.schedule]
 
 
 def design(model: StateModel, weights: Weights, weight_factor: float = 1.0) -> TrackingDesign:
-    """The gains for a model of G.
+    """The gains for a model of G; weight_factor: see `feedback_around`.
 
-    weight_factor: see `feedback_around`. Raises ParameterError where no gains exist.
+    Raises ParameterError where no gains exist.
     """
-    # rad per sample, up to which y is corrected while the reference rests
-    rest_bandwidth = 1.0 / 80.0
-    rho = input_weight(model, weights)
+    rest_bandwidth = 1.0 / 80.0  # rad per sample, up to which y is corrected at rest
+    # A slope, in first guesses. Plants that bear less are led astray by any feedback that would
+    # help, and learn faster than they go astray without.
+    wrong_slope = 1.35
+    rho = weights.input_weight * power_gain(model.transfer_function, np.pi / 10.0)
     plans = tuple(
-        _plan(model, lq_gains(model, more * rho, weights.integral_weight, weights.preview))
+        _plan(model, preview_gains(model, more * rho, weights.integral_weight, weights.preview))
         for more in SOFTER)
     feedback = feedback_around(model, weights, weight_factor)
-    schedule = [feedback.gain.tolist(), *(
-        lq_gains(model, max(more, weight_factor) * rho).state.tolist() for more in SCHEDULE[1:]
-    )]
+    softer = [preview_gains(model, max(more, weight_factor) * rho).state for more in SCHEDULE[1:]]
+    schedule = feedback.state.tolist(), *(gain.tolist() for gain in softer)
+    bears = tolerates(model, softer[SOFTEST - 1], wrong_slope)
     # With |G|^2 at a frequency as weight of u^2, feedback acts up to about that frequency.
-    gentle = lq_gains(model, power_gain(model.transfer_function, rest_bandwidth)).state
+    gentle = preview_gains(model, power_gain(model.transfer_function, rest_bandwidth)).state
     ahead, later = (powers(model.a, model.b, k).sum(axis=0) for k in (LOOK_AHEAD, HORIZON))
     return TrackingDesign(
-        model, plans, feedback, tuple(schedule),
-        schedule[SOFTEST] if _bears_wrong_slope(model, SCHEDULE[SOFTEST] * rho) else None,
-        gentle.tolist(),
-        float(np.linalg.norm(later)), model.c * abs(float(ahead[0])),
-    )
+        model, plans, feedback, schedule, schedule[SOFTEST] if bears else None, gentle.tolist(),
+        float(np.linalg.norm(later)), model.c * abs(float(ahead[0])))
 
 
 def better_design(
@@ -164,21 +154,17 @@ def better_design(
 ) -> TrackingDesign | None:
     """Return the design for a better model of G, None where it is no safe replacement.
 
-    It replaces the present one where its loop around the better G keeps a modulus margin that is
-    safe in any case, or at least as large as that of the present loop around the G it was made
-    for or around the better one; the weight of its input is raised as far as this takes, and no
-    further: what is weaker than it has to be is the measure for the next G, and so lost for good.
-    A loop that is unstable around the better G is replaced by any stable one; an unstable one
-    replaces none.
+    Its loop has to keep a modulus margin that is safe in any case, or at least that of the present
+    loop around its own G or around the better one. The weight of its input is raised as far as this
+    takes and no further: it is the measure for the next G.
     """
     needed = 0.5  # no sensitivity above 2
     try:
         for weight_factor in SAFER:
-            reached = modulus_margin(model, feedback_around(model, weights, weight_factor))
+            reached = modulus_margin(model, model, feedback_around(model, weights, weight_factor))
             if reached < needed and weight_factor == SAFER[0]:
-                needed = min(needed, *(
-                    modulus_margin(plant, present.feedback) for plant in (present.model, model)
-                ))
+                needed = min(needed, *(modulus_margin(plant, present.model, present.feedback)
+                                       for plant in (present.model, model)))
             if 0.0 < reached >= needed:
                 return design(model, weights, weight_factor)
     except ParameterError:
@@ -186,19 +172,13 @@ def better_design(
     return None
 
 
-def feedback_around(model: StateModel, weights: Weights, weight_factor: float) -> Feedback:
+def feedback_around(model: StateModel, weights: Weights, weight_factor: float) -> PreviewGains:
     """Of deviations from the trajectory, as if the input weighed `weight_factor` times as much.
 
     Raises ParameterError where no gains exist.
     """
-    rho = weight_factor * input_weight(model, weights)
-    gains = lq_gains(model, rho, weights.integral_weight)
-    return Feedback(model, gains.state, gains.integral)
-
-
-def input_weight(model: StateModel, weights: Weights) -> float:
-    """rho of the trajectory."""
-    return weights.input_weight * power_gain(model.transfer_function, np.pi / 10.0)
+    rho = weights.input_weight * power_gain(model.transfer_function, np.pi / 10.0)
+    return preview_gains(model, weight_factor * rho, weights.integral_weight)
 
 
 def power_gain(model: TransferFunction, frequency: float) -> float:
@@ -206,67 +186,125 @@ def power_gain(model: TransferFunction, frequency: float) -> float:
     return float(abs(model.response(np.array([np.exp(1j * frequency)]))[0])) ** 2
 
 
-# What follows is cached: a controller restarts in the middle of a loop.
-@lru_cache(maxsize=64)
-def lq_gains(
-    model: StateModel, input_weight: float, integral_weight: float = 0.0, window: int = 0,
-) -> PreviewGains:
-    """The gains of `preview_gains`."""
-    return preview_gains(model, input_weight, integral_weight, window)
-
-
-@lru_cache(maxsize=16)
-def _bears_wrong_slope(model: StateModel, input_weight: float) -> bool:
-    # Slope, in first guesses. Plants that bear less are led astray by any feedback that would help,
-    # and learn faster than they go astray without.
-    wrong_slope = 1.35
-    return tolerates(Feedback(model, lq_gains(model, input_weight).state), wrong_slope)
-
-
-def _closed(model: StateModel, gains: PreviewGains) -> Array:
-    """Transition of [x*; q*], shape (n + 1, n + 1)."""
-    n = model.order
-    closed = np.eye(n + 1)
-    closed[:n, :n] = model.a - np.outer(model.b, gains.state)
-    closed[:n, n] = -gains.integral * model.b
-    closed[n, 0] = -model.c
-    return closed
+def dot(a: Sequence[float], b: Sequence[float]) -> float:
+    """Inner product of two states: beside so few numbers a call of NumPy takes longer."""
+    product: float = sum(map(mul, a, b))
+    return product
 
 
 def _plan(model: StateModel, gains: PreviewGains) -> Plan:
-    """u* of the next samples, of [x*; q*] and of the references, which stay at their last one."""
     n, last = model.order, len(gains.preview) - 1
     length = min(LOOK_AHEAD, last // 3) + 1
-    closed = _closed(model, gains)
+    closed = np.eye(n + 1)
+    closed[:n, :n] = model.a - np.outer(model.b, gains.state)
+    closed[:n, n], closed[n, 0] = -gains.integral * model.b, -model.c
     k = np.append(gains.state, gains.integral)
-    by_state: Array = np.eye(n + 1)  # what makes [x*; q*]
+    by_state: Array = np.eye(n + 1)  # what makes z
     by_reference: Array = np.zeros((n + 1, last + 1))
     states, references = np.empty((length, n + 1)), np.empty((length, last + 1))
     for j in range(length):
         preview = np.zeros(last + 1)
         preview[j:] = gains.preview[:last + 1 - j]
-        preview[last] += gains.preview[last + 1 - j:].sum()
-        states[j] = -k @ by_state
-        references[j] = -k @ by_reference - preview
+        preview[last] += gains.preview[last + 1 - j:].sum()  # references stay at their last one
+        states[j], references[j] = -k @ by_state, -k @ by_reference - preview
         by_reference = np.asarray(closed @ by_reference)
         by_reference[:n] -= np.outer(model.b, preview)
         by_reference[n, min(j, last)] += 1.0
         by_state = closed @ by_state
-    # What is ahead rests on references that are not averaged yet as well.
-    tail = float(np.linalg.norm(references[:, 2 * last // 3:], axis=1).max())
-    u_noise, x_noise = _of_noise(model, gains)
-    return Plan(gains, states, references, np.maximum(u_noise, tail), x_noise)
-
-
-def _of_noise(model: StateModel, gains: PreviewGains) -> tuple[Array, tuple[Array, ...]]:
-    """Deviation of u*, covariance of x* for noise of 1 on the references, for their averages."""
+    # u* and x* for noise of 1 on the references, for their averages.
     responses = powers(model.a - np.outer(model.b, gains.state), model.b, HORIZON)
     to_u = np.append(1.0, -responses @ gains.state)
-    signals = np.column_stack([to_u, np.vstack([np.zeros(model.order), responses])])
+    signals = np.column_stack([to_u, np.vstack([np.zeros(n), responses])])
     u_noise, x_noise = [], []
-    for kernel in averages(len(gains.preview) - 1):
+    for kernel in averages(last):
         weights = np.convolve(kernel, gains.preview[::-1])
         of_all = np.array([np.convolve(weights, signal) for signal in signals.T])
         u_noise.append(np.linalg.norm(of_all[0]))
         x_noise.append(of_all[1:] @ of_all[1:].T)
-    return np.array(u_noise), tuple(x_noise)
+    # What is ahead rests on references that are not averaged yet as well.
+    tail = float(np.linalg.norm(references[:, 2 * last // 3:], axis=1).max())
+    return Plan(gains, closed, states, references, np.maximum(np.array(u_noise), tail),
+                tuple(x_noise))
+
+
+# --- how far feedback u = -K x_hat - K_q q is from instability, q(k+1) = q(k) - y(k) --------------
+# x_hat comes from an observer of [x; d] as in FixedBacklash that believes `model`, d being a slow
+# disturbance of u.
+
+
+def tolerates(model: StateModel, gain: Array, factor: float) -> bool:
+    """Whether feedback keeps its G stable although u acts `factor` times as strongly.
+
+    The observer does not know of the factor. The gap itself is left out: it limits what u can do
+    wrong, but not for ever.
+    """
+    return all(_is_stable(model, model, gain, 0.0, each, factor) for each in CONFIDENCES)
+
+
+def modulus_margin(plant: StateModel, model: StateModel, gains: PreviewGains) -> float:
+    """Distance of the open loop L from -1, min |1 + L| over all frequencies.
+
+    For the worst of the observers; 0 where the loop is unstable with one of them.
+    """
+    if not all(_is_stable(plant, model, gains.state, gains.integral, each) for each in CONFIDENCES):
+        return 0.0
+    return min(_distance(plant, model, gains, each) for each in CONFIDENCES)
+
+
+def _is_stable(
+    plant: StateModel, model: StateModel, gain: Array, integral: float, confidence: float,
+    factor: float = 1.0,
+) -> bool:
+    """Whether the loop with the state [x of the plant; x_hat; d_hat; q] is stable."""
+    observer = _observer(model, confidence)
+    if observer is None:
+        return False
+    believed, drive, seen, correction = observer
+    n = plant.order
+    size = n + len(drive) + 1
+    gains, loop = np.zeros(size), np.zeros((size, size))
+    gains[n:-2], gains[-1] = gain, integral
+    loop[:n, :n] = plant.a
+    loop[:n] -= factor * np.outer(plant.b, gains)
+    # x_hat(k+1) = prediction + correction (y(k+1) - its prediction)
+    loop[n:-1, n:-1] = believed
+    loop[n:-1] -= np.outer(drive, gains)
+    loop[n:-1] += np.outer(correction, plant.c * loop[0] - seen @ loop[n:-1])
+    if integral:
+        loop[-1, 0], loop[-1, -1] = -plant.c, 1.0
+    return bool(np.abs(np.linalg.eigvals(loop)).max() < 1.0)
+
+
+def _distance(
+    plant: StateModel, model: StateModel, gains: PreviewGains, confidence: float,
+) -> float:
+    """Least |1 + L| of a stable loop, opened at u."""
+    observer = _observer(model, confidence)
+    assert observer is not None
+    believed, drive, seen, correction = observer
+    gain = np.append(gains.state, 0.0)
+    closed = believed - np.outer(drive, gain)
+    closed -= np.outer(correction, seen @ closed)
+    z = np.exp(1j * np.geomspace(1e-3, np.pi, 120))
+    at = z[:, None, None]
+    x_hat = np.linalg.solve(at * np.eye(len(gain)) - closed, at * correction[:, None])
+    minus_u = (gain @ x_hat)[:, 0] - gains.integral / (z - 1.0)
+    return float(np.abs(1.0 + plant.transfer_function.response(z) * minus_u).min())
+
+
+@lru_cache(maxsize=16)
+def _observer(model: StateModel, confidence: float) -> tuple[Array, Array, Array, Array] | None:
+    """Transition, input, output and gain of the observer of [x; d]; None where none exists."""
+    n = model.order
+    a, b, c = np.eye(n + 1), np.append(model.b, 0.0), np.zeros(n + 1)
+    a[:n, :n], a[:n, n], c[0] = model.a, model.b, model.c
+    # In units in which one sample of d moves y like its noise does; a trace of noise on x keeps
+    # the equation regular.
+    drift = 1e-12 * np.eye(n + 1)
+    drift[-1, -1] += 1.0
+    drift *= confidence / (float(np.linalg.norm(model.b)) * model.c) ** 2
+    try:
+        p = riccati(a.T, c, drift)
+    except np.linalg.LinAlgError:
+        return None
+    return a, b, c, np.asarray(p @ c / (c @ p @ c + 1.0))

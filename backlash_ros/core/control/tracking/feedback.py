@@ -11,14 +11,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import hypot, inf, isnan, nan
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.control.protocol import LARGEST_FEEDBACK, LARGEST_IN_ACQUISITION, dot
-from backlash_ros.core.control.tracking.design import SOFTEST, Gain, TrackingDesign
-from backlash_ros.core.control.tracking.deviation_noise import DeviationNoise
-from backlash_ros.core.control.tracking.rest import ARRIVED, ASTRAY, TOLERANCE
+from backlash_ros.core.control.protocol import LARGEST_FEEDBACK, LARGEST_IN_ACQUISITION
+from backlash_ros.core.control.tracking.design import SOFTEST, Gain, TrackingDesign, dot
+from backlash_ros.core.control.tracking.rest import ARRIVED, ASTRAY, CLOSE, TOLERANCE, UNCERTAIN
 from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.plant.backlash import Region
 
@@ -33,9 +33,9 @@ SHARP, SHARP_COUNTS = 0.01, 17
 class Trust:
     """What was made of the estimates so far.
 
-    known: whether the newest comes from data of this loop. slope: that is inverted. crossings: that
-    are inverted, shrunk by their uncertainty. held_for: samples for which estimates have held,
-    sharp ones counted more. in_use_for: samples since there is one. sharp_counts: see above.
+    known: whether the newest comes from data of this loop. slope, crossings: that are inverted,
+    crossings shrunk by their uncertainty. held_for: samples for which estimates have held, sharp
+    ones counted sharp_counts times. in_use_for: samples since there is one.
     """
 
     known: bool = False
@@ -46,13 +46,8 @@ class Trust:
     sharp_counts: int = SHARP_COUNTS
 
     @property
-    def begun(self) -> bool:
-        """Whether an estimate is relied on at all."""
-        return self.held_for > 0
-
-    @property
     def full(self) -> bool:
-        """Whether it has held for long enough."""
+        """Whether an estimate has held for long enough."""
         return self.held_for >= TRUSTED_AFTER
 
 
@@ -75,24 +70,41 @@ class FeedbackState:
     blind_for: int = 1
 
 
+class DeviationNoise(NamedTuple):
+    """How much of x_hat - x* may be noise: of y, of x_hat, and of the references that make x*.
+
+    x_cov: of x_hat, None where it is unknown. x_std: of |x_hat|. u_std: of K (x_hat - x*) for every
+    gain of the schedule, and at least K times errors of y of half its noise, as configured.
+    ignored: |x_hat - x*| that is left alone. tolerated: that is worth no crossing.
+    """
+
+    u_std: list[float]
+    x_cov: Array | None = None
+    x_std: float = 0.0
+    ignored: float = 0.0
+    tolerated: float = 0.0
+
+
 class StateFeedback:
     """Gains of a design, used as far as the estimate is trusted.
 
     While nothing is known the acquisition gain replaces K, and the trajectory itself excites the
-    backlash. shrinkage: standard deviations by which crossings are shrunk. noise_std: of y.
+    backlash. shrinkage: standard deviations by which crossings are shrunk. noise_std: of y. gap_u:
+    u that the gap takes.
     """
 
     def __init__(self, design: TrackingDesign, shrinkage: float, noise_std: float) -> None:
         self.trust, self.state = Trust(), FeedbackState()
         self._shrinkage, self._y_std = shrinkage, noise_std
         self._newest: Estimate | None = None
-        self.gap_u = 0.0  # that the gap takes
+        self.gap_u = 0.0
         self.use(design)
 
     def use(self, design: TrackingDesign) -> None:
         """Use these gains."""
         self._design = design
-        self.noise = DeviationNoise(design, self._y_std)
+        self._least = 0.5 * self._y_std * np.array([hypot(*gain) for gain in design.schedule])
+        self.noise = DeviationNoise(self._least.tolist())
         self._holding = design.holding  # made here, before a command waits for it
         # Places in the schedule: of the gain that its noise asks for, and of the one in use.
         self._quiet = self._in_use = 0
@@ -102,8 +114,7 @@ class StateFeedback:
 
         state_known: whether it does not.
         """
-        self.trust, self.state = replace(other.trust), replace(other.state)
-        self.gap_u = other.gap_u
+        self.trust, self.state, self.gap_u = replace(other.trust), replace(other.state), other.gap_u
         self.prepare(other.noise.x_cov, self._y_std)
         if not state_known:
             self.trust = Trust(sharp_counts=1)
@@ -151,10 +162,26 @@ class StateFeedback:
         self, x_cov: Array | None, y_std: float, x_noise: Array | None = None,
         reference_std: float = 0.0,
     ) -> None:
-        """Take in what `DeviationNoise` does."""
-        self.noise.take(x_cov, y_std, x_noise, reference_std)
+        """Take in how noisy this sample is, and choose the gain that it allows.
+
+        y_std: as measured. x_noise: covariance of x* for noise of 1 in the references.
+        """
+        u_std, _, x_std, *_ = self.noise
+        deviation_std = 0.0
+        if x_cov is not None:
+            variances = of_x_hat = self._design.variances(x_cov)
+            if x_noise is not None:
+                variances = of_x_hat + reference_std**2 * self._design.variances(x_noise)
+            stds = np.sqrt(np.maximum(variances, 0.0))
+            x_std = max(of_x_hat.item(-1), 0.0)**0.5
+            u_std, deviation_std = np.maximum(stds[:-1], self._least).tolist(), stds.item(-1)
+        # By as much v may rest off: one rule for motion and rest.
+        ignored = ARRIVED * max(CLOSE * y_std, UNCERTAIN * x_std)
+        # What noise of the references moves and v did not follow shows as a deviation as well.
+        tolerated = max(ignored, ARRIVED * UNCERTAIN * deviation_std)
+        self.noise = DeviationNoise(u_std, x_cov, x_std, ignored, tolerated)
         # As hard as leaves what feedback makes of noise below a tenth of the u that the gap takes.
-        u_std, most = self.noise.u_std, 0.1 * self.gap_u or inf
+        most = 0.1 * self.gap_u or inf
         self._quiet = next((i for i, std in enumerate(u_std) if std <= most), len(u_std) - 1)
 
     def deviation(self, x_hat: Sequence[float] | Array, x: Sequence[float]) -> list[float]:
@@ -167,7 +194,7 @@ class StateFeedback:
     @property
     def knows_noise(self) -> bool:
         """Whether full feedback can tell a deviation from noise."""
-        return self.trust.full and self.noise.known
+        return self.trust.full and self.noise.x_cov is not None
 
     def u(
         self, deviation: Sequence[float], held_back: bool, largest: float,
@@ -177,14 +204,14 @@ class StateFeedback:
         held_back: whether v met its limits, or is on its way across the gap. largest: |x*| so far.
         """
         widening = 1.03  # per sample, of the bound on feedback while the backlash is unknown
-        state, most = self.state, self.most
-        if self.trust.begun:
-            off = hypot(*deviation)
-            astray = off > max(largest, ASTRAY / ARRIVED * self.noise.ignored)
+        state, most, begun = self.state, self.most, self.trust.held_for > 0
+        if begun:
+            off, noise = hypot(*deviation), self.noise
+            astray = off > max(largest, ASTRAY / ARRIVED * noise.ignored)
             feedback = worth = dot(self._gain(held_back or state.bounded, astray), deviation)
             if self.knows_noise:
-                feedback *= 1.0 - self.noise.ignored / max(off, self.noise.ignored)
-                worth *= 1.0 - self.noise.tolerated / max(off, self.noise.tolerated)
+                feedback *= 1.0 - noise.ignored / max(off, noise.ignored)
+                worth *= 1.0 - noise.tolerated / max(off, noise.tolerated)
         else:
             feedback = worth = dot(self._design.acquisition or (), deviation)
             if not -most < feedback < most:
@@ -193,7 +220,7 @@ class StateFeedback:
         if self.trust.full:
             by_integral = self._design.feedback.integral * state.integral
             feedback, worth = feedback + by_integral, worth + by_integral
-        state.bounded = self.trust.begun and not -most <= feedback <= most
+        state.bounded = begun and not -most <= feedback <= most
         if isnan(feedback):
             return 0.0, 0.0
         return min(max(feedback, -most), most), min(max(worth, -most), most)
@@ -218,7 +245,6 @@ class StateFeedback:
 
     @property
     def _scale(self) -> float:
-        """The u that the gap takes, or the largest |u*| so far."""
         return max(self.state.asked, self.gap_u)
 
     @property
@@ -234,16 +260,16 @@ class StateFeedback:
         feedback slows down. Once it is known no error of y that would not matter at rest calls for
         too much.
         """
-        if not self.trust.begun:
+        if not self.trust.held_for:
             return self.state.width * self._scale
         # |K|: what full feedback makes of an error of y.
-        by_noise = TOLERANCE * self._y_std * self._design.schedule_sizes[0]
+        by_noise = TOLERANCE * self._y_std * hypot(*self._design.schedule[0])
         return LARGEST_FEEDBACK * max(self._scale, by_noise)
 
     @property
     def reach(self) -> float:
         """Largest |u_d - u*|, whatever makes u_d."""
-        return self.most if self.trust.begun else LARGEST_IN_ACQUISITION * self._scale
+        return self.most if self.trust.held_for else LARGEST_IN_ACQUISITION * self._scale
 
     def _gain(self, held_back: bool, astray: bool) -> Gain:
         """K, or the less of it the longer v does not follow, and the newer the estimate.
@@ -252,7 +278,7 @@ class StateFeedback:
         leads it: then it does not matter what noise makes v do.
         """
         stiffen_after = 20  # samples without a limit after which feedback takes a step back to full
-        state, schedule = self.state, self._design.schedule
+        state = self.state
         state.free = 0 if held_back else state.free + 1
         if held_back:
             state.level = min(state.level + 1, SOFTEST)
@@ -260,22 +286,20 @@ class StateFeedback:
             state.level -= 1
         unproven = SOFTEST - self.trust.held_for * (SOFTEST + 1) // TRUSTED_AFTER
         self._in_use = max(state.level, unproven, 0 if astray else self._quiet)
-        return schedule[self._in_use]
+        return self._design.schedule[self._in_use]
 
 
 def shrunk_crossings(estimate: Estimate, deviations: float, known: bool) -> tuple[float, float]:
     """Crossings shrunk towards each other by their uncertainty; both 0 while nothing is known.
 
-    Over-compensation drives past the gap and starts a limit cycle, under-compensation only
-    leaves a rest of the backlash: in a loop around y the smaller gap is the safe one. Where a law
-    knows no uncertainty there is nothing to shrink by once the crossings are known.
+    Over-compensation drives past the gap and starts a limit cycle, under-compensation only leaves
+    a rest of the backlash: in a loop around y the smaller gap is the safe one. Where a law knows
+    no uncertainty there is nothing to shrink by once the crossings are known.
     """
     if deviations == 0.0:
         return estimate.c_r, estimate.c_l
     if isnan(estimate.std_c_r):
         return (estimate.c_r, estimate.c_l) if known else (0.0, 0.0)
     middle = 0.5 * (estimate.c_r + estimate.c_l)
-    return (
-        max(estimate.c_r - deviations * estimate.std_c_r, middle),
-        min(estimate.c_l + deviations * estimate.std_c_l, middle),
-    )
+    return (max(estimate.c_r - deviations * estimate.std_c_r, middle),
+            min(estimate.c_l + deviations * estimate.std_c_l, middle))

@@ -14,7 +14,8 @@ Reference: M. Tomizuka, Optimal continuous finite preview problem, IEEE Trans. A
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +27,7 @@ from backlash_ros.core.plant.transfer_function import StateModel, TransferFuncti
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class PreviewGains:
+class PreviewGains(NamedTuple):
     """state: K of x, shape (n,). integral: K of q. preview: f_0 .. f_N, shape (N + 1,)."""
 
     state: Array
@@ -35,24 +35,24 @@ class PreviewGains:
     preview: Array
 
 
+# A controller restarts in the middle of a loop, and must not wait for them then.
+@lru_cache(maxsize=64)
 def preview_gains(
-    model: StateModel, input_weight: float, integral_weight: float, window: int,
+    model: StateModel, input_weight: float, integral_weight: float = 0.0, window: int = 0,
 ) -> PreviewGains:
     """Gains for rho = input_weight > 0, w_i = integral_weight >= 0, N = window >= 0.
 
     Raises ParameterError where G cannot be stabilised or, with w_i > 0, has a zero at z = 1.
     """
-    n = model.order
-    integrates = integral_weight > 0.0
-    size = n + 1 if integrates else n
+    n, integrates = model.order, integral_weight > 0.0
+    size = n + integrates
     a, b, c, e = np.zeros((size, size)), np.zeros(size), np.zeros(size), np.zeros(size)
     # u in units of 1/sqrt(rho): the Riccati equation is then solved with weights of one size.
     unit = input_weight**-0.5
     a[:n, :n], b[:n], c[0] = model.a, model.b * unit, model.c
     q: Array = np.asarray(np.outer(c, c), np.float64)
     if integrates:
-        a[n, 0], a[n, n], e[n] = -model.c, 1.0, 1.0
-        q[n, n] = integral_weight
+        a[n, 0], a[n, n], e[n], q[n, n] = -model.c, 1.0, 1.0, integral_weight
     try:
         p = riccati(a, b, q)
     except np.linalg.LinAlgError:
@@ -100,7 +100,6 @@ def _holding(model: TransferFunction, window: int) -> Array:
         return taps  # nothing holds y, or u = 0 does
     delay = float(np.polyval(np.polyder(a), 1.0) / a_1 - np.polyval(np.polyder(b), 1.0) / b_1)
     whole, part = divmod(min(max(delay, 0.0), float(window)), 1.0)
-    first = int(whole)
-    taps[first] = 1.0 - part
-    taps[min(first + 1, window)] += part
+    taps[int(whole)] = 1.0 - part
+    taps[min(int(whole) + 1, window)] += part
     return taps * (a_1 / b_1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,28 +12,14 @@ from backlash_ros.core.plant.numerics import NoiseLevel
 Array = NDArray[np.float64]
 
 
-class Parabolas(NamedTuple):
+@lru_cache(maxsize=16)
+def _parabolas(preview: int) -> tuple[Array, list[int], list[int]]:
     """What parabolas take from 2 H + 1 references, for several widths w <= H to either side.
 
-    fits: for each width, one below the other, what is left of the middle 2 w + 1 references beside
-    a parabola through them, shape (sum (2 w + 1), 2 H + 1). first: row of each width. degrees: of
-    freedom of its rest. middle: rest of the middle reference, as a row of all.
+    For each width, one below the other, what is left of the middle 2 w + 1 references beside a
+    parabola through them, weighted by a Hann window, shape (sum (2 w + 1), 2 H + 1); the first row
+    of each; and the widths, none more than a third of the preview.
     """
-
-    fits: Array
-    first: list[int]
-    degrees: list[int]
-    middle: list[int]
-
-    @property
-    def half(self) -> int:
-        """H."""
-        return self.fits.shape[1] // 2
-
-
-@lru_cache(maxsize=16)
-def parabolas(preview: int) -> Parabolas:
-    """No width is more than a third of the preview. The fit is weighted by a Hann window."""
     widths = [w for w in (3, 8, 20) if 3 * w <= preview]
     half, sizes = max(widths, default=0), [2 * w + 1 for w in widths]
     first = [sum(sizes[:i]) for i in range(len(sizes))]
@@ -44,29 +29,25 @@ def parabolas(preview: int) -> Parabolas:
         weighted = powers * np.hanning(2 * w + 3)[1:-1, None]
         fit = powers @ np.linalg.solve(weighted.T @ powers, weighted.T)
         fits[row:row + 2 * w + 1, half - w:half + w + 1] = np.eye(2 * w + 1) - fit
-    return Parabolas(fits, first, [2 * w - 2 for w in widths],
-                     [row + w for w, row in zip(widths, first, strict=True)])
+    return fits, first, widths
 
 
 def averages(preview: int) -> Array:
     """Weights of no average and of that of each width, shape (widths + 1, 2 H + 1)."""
-    fits = parabolas(preview)
-    kernels = np.zeros((len(fits.first) + 1, 2 * fits.half + 1))
-    kernels[:, fits.half] = 1.0
-    kernels[1:] -= fits.fits[fits.middle]
+    fits, first, widths = _parabolas(preview)
+    kernels = np.zeros((len(widths) + 1, fits.shape[1]))
+    kernels[:, fits.shape[1] // 2] = 1.0
+    kernels[1:] -= fits[np.add(first, widths).astype(int)]
     return kernels
 
 
 class ReferenceWindow:
-    """r(k) .. r(k + N) without the noise of y_m, and what came before.
+    """r(k) .. r(k + N) without the noise of y_m, and `history` references before them; preview: N.
 
     Each reference is replaced by the middle of a parabola through those around it, as many as are
-    one but for the noise: steps and turns stay what they are, and without noise nothing changes.
-    The newest N / 3 stay as they came.
-
-    preview: N. history: how many references before r(k) are kept. noise_gains: standard deviation
-    of u* for noise of 1 that was averaged so, shape (widths,). What `settle` has found within the
-    window: low, high; noise_spread, by how much noise parts them at most; u_noise_std, largest
+    one but for the noise: steps and turns stay what they are. The newest N / 3 stay as they came.
+    noise_gains: standard deviation of u* for noise of 1 that was averaged so, shape (widths,).
+    noise_spread: by how much noise parts low and high of the window at most. u_noise_std: largest
     deviation of u* by what is left of the noise.
     """
 
@@ -123,7 +104,7 @@ class ReferenceWindow:
 
     def settle(self) -> None:
         """Make of the newest reference what only the next sample needs."""
-        newest, half = self._end - 1, parabolas(self._preview).half
+        newest, half = self._end - 1, max(_parabolas(self._preview)[2], default=0)
         self._rows[0, newest] = self._rows[1, newest]
         self._rows[2, newest] = self.noise_gains[0]
         self._noise.take(self._rows.item(0, newest))
@@ -135,8 +116,7 @@ class ReferenceWindow:
         if std > 0.0:
             self.noise_spread = 8.0 * std
             first = self._end - self._preview - 1
-            last = max(self._end - half, first + 1)
-            self.u_noise_gain = float(self._rows[2, first:last].max())
+            self.u_noise_gain = float(self._rows[2, first:max(self._end - half, first + 1)].max())
             self.u_noise_std = std * self.u_noise_gain
         if self._end == self._rows.shape[1]:
             self._rows[:, :self._kept] = self._rows[:, -self._kept:]
@@ -147,17 +127,15 @@ class ReferenceWindow:
         # Mean square of what is left beside a parabola, in those of the noise, up to which the
         # references are taken for one, and from which on not: at a step, or a sharp turn.
         one, none = 1.8, 3.0
-        beside = parabolas(self._preview)
-        fits, first, degrees, middle = beside
-        half, came, noise = beside.half, self._rows[0], self._noise.std
-        rest = fits @ came[at - half:at + half + 1]
-        of_noise = rest / noise  # its square may be too small for a number
+        fits, first, widths = _parabolas(self._preview)
+        rest = fits @ self._rows[0, at - widths[-1]:at + widths[-1] + 1]
+        of_noise = rest / self._noise.std  # its square may be too small for a number
         squares = np.add.reduceat(of_noise * of_noise, first).tolist()
-        reference = value = came.item(at)
+        reference = value = self._rows.item(0, at)
         gain = float(self.noise_gains[0])
-        for i, square in enumerate(squares):
-            share = min((none - square / degrees[i]) / (none - one), 1.0)
+        for i, (w, row, square) in enumerate(zip(widths, first, squares, strict=True)):
+            share = min((none - square / (2 * w - 2)) / (none - one), 1.0)
             if share > 0.0:
-                value += share * (reference - rest.item(middle[i]) - value)
+                value += share * (reference - rest.item(row + w) - value)
                 gain += share * (self.noise_gains.item(i + 1) - gain)
         self._rows[1, at], self._rows[2, at] = value, gain

@@ -1,15 +1,9 @@
 """What v does while the reference rests: as little as keeps y where it belongs.
 
 Feedback through a gap that is not known to the last digit would limit-cycle. So v is held while y
-is within a tolerance of the trajectory, and otherwise moves in single steps:
-
-- to the u that holds G at rest, stopping short of it by what is uncertain about the crossing. What
-  is left of u shows in y. Once it is known it is taken away by going on in the same direction,
-  which crosses no gap;
-- where y has left the tolerance, to a u that brings it back, and then to rest again.
-
-Full feedback is for a y that is far away: it brings back all that is off, in as many moves as G has
-states, and one more. What is less it would leave to itself, as noise, until it is far away.
+is within a tolerance of the trajectory, and otherwise moves in single steps (see `Mode`). Full
+feedback brings back all that is off, in as many moves as G has states, and one more; what is less
+it would leave to itself, as noise, until it is far away.
 """
 
 from __future__ import annotations
@@ -20,8 +14,7 @@ from enum import Enum, auto
 from math import hypot
 
 from backlash_ros.core.control.inverse import BacklashInverse
-from backlash_ros.core.control.protocol import dot
-from backlash_ros.core.control.tracking.design import TrackingDesign
+from backlash_ros.core.control.tracking.design import TrackingDesign, dot
 from backlash_ros.core.control.tracking.trajectory import TrajectoryState
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.plant.backlash import Region
@@ -48,8 +41,10 @@ class Mode(Enum):
 
     FOLLOW = auto()  # the trajectory moves
     RETURN = auto()  # y is far away: full feedback brings it back
-    HOLD = auto()  # u is to be that at rest
-    LEAD_BACK = auto()  # u is to bring y back
+    # To the u that holds G at rest, short of it by what is uncertain about the crossing. What is
+    # left of u shows in y; once it is known v goes on in the same direction, which crosses no gap.
+    HOLD = auto()
+    LEAD_BACK = auto()  # to a u that brings y back into the tolerance, then to rest again
 
     @property
     def steps(self) -> bool:
@@ -58,20 +53,20 @@ class Mode(Enum):
 
 
 @dataclass
-class RestState:
-    """How v rests.
+class Rest:
+    """Decides whether v rests, and steps it there.
 
-    u_d: where v rests. shrinkage: standard deviations by which the crossings are shrunk for it.
+    target: u_d where v rests, and the standard deviations by which the crossings are shrunk for it.
     largest: |x*| so far. limit: tolerance in use. rested: samples for which the trajectory has.
     returns, leads: how often y was brought back since, by full feedback and gently. turns, side: of
     v in this return, and the newest line. near: samples since y was last away. pull: u - u* with
     which leading back began.
     """
 
+    design: TrackingDesign
     mode: Mode = Mode.HOLD
-    u_d: float = 0.0
+    target: tuple[float, float] = (0.0, 0.0)
     side: Region = Region.GAP
-    shrinkage: float = 0.0
     largest: float = 0.0
     limit: float = 0.0
     rested: int = 0
@@ -80,18 +75,6 @@ class RestState:
     turns: int = 0
     near: int = 0
     pull: float = 0.0
-
-
-class Rest:
-    """Decides whether v rests, and steps it there."""
-
-    def __init__(self, design: TrackingDesign) -> None:
-        self.state = RestState()
-        self.use(design)
-
-    def use(self, design: TrackingDesign) -> None:
-        """Rest as this design says."""
-        self._design = design
 
     def decide(
         self, y: float, noise_std: float, r: float, spread: float, plan: TrajectoryState,
@@ -103,85 +86,81 @@ class Rest:
         deviation: x_hat - x*. x_std: standard deviation of x_hat, None where it is unknown. side:
         line in use. pull: see `pull_back`. acts: whether feedback asks for more than its noise.
         """
-        state = self.state
-        state.largest = max(state.largest, hypot(*plan.x))
-        least = 1e-5 * state.largest  # tolerance, where that is more
+        self.largest = max(self.largest, hypot(*plan.x))
+        least = 1e-5 * self.largest  # tolerance, where that is more
         still = 0.004 * max(TOLERANCE * noise_std, least)  # by which x* may move per sample
-        if spread > noise_std or (state.mode is Mode.FOLLOW and plan.moved > still):
-            state.mode, state.rested, state.returns, state.leads = Mode.FOLLOW, 0, 0, 0
+        if spread > noise_std or (self.mode is Mode.FOLLOW and plan.moved > still):
+            self.mode, self.rested, self.returns, self.leads = Mode.FOLLOW, 0, 0, 0
         elif x_std is None:
-            off = abs(y - r) > OFF * noise_std
-            state.mode = Mode.RETURN if off else Mode.HOLD
+            self.mode = Mode.RETURN if abs(y - r) > OFF * noise_std else Mode.HOLD
         else:
-            state.rested += 1
-            width = CLOSE if state.rested < SETTLING else TOLERANCE
+            self.rested += 1
+            width = CLOSE if self.rested < SETTLING else TOLERANCE
             # Where y left again each time, the constants do not tell how to come closer.
-            width *= 2.0 ** min(max(state.leads - MOST_RETURNS, 0), 10)
-            state.limit = max(width * noise_std, least, UNCERTAIN * x_std)
-            if state.mode is Mode.RETURN and side is not state.side:
-                state.turns += 1
-            state.mode = self._mode_at_rest(hypot(*deviation), pull, acts)
-        state.side = side
-        return state.mode
+            width *= 2.0 ** min(max(self.leads - MOST_RETURNS, 0), 10)
+            self.limit = max(width * noise_std, least, UNCERTAIN * x_std)
+            if self.mode is Mode.RETURN and side is not self.side:
+                self.turns += 1
+            self.mode = self._mode_at_rest(hypot(*deviation), pull, acts)
+        self.side = side
+        return self.mode
 
     def _mode_at_rest(self, size: float, pull: float, acts: bool) -> Mode:
-        """size: |x_hat - x*|. pull: what would bring y back gently."""
-        state = self.state
         # Crossing the gap takes time. Full feedback that turns again and again overshoots by that;
         # it is due again when y has stayed where it belongs for a while, and is pushed away.
-        state.near = state.near + 1 if size <= state.limit else 0
-        if state.near >= SETTLING:
-            state.returns = state.leads = 0
-        returns = state.mode is Mode.RETURN
-        if state.turns <= self._design.model.order if returns else state.returns < MOST_RETURNS:
-            goes_on = not state.mode.steps and acts and size > ARRIVED * state.limit
-            if goes_on or size > ASTRAY * state.limit:
+        self.near = self.near + 1 if size <= self.limit else 0
+        if self.near >= SETTLING:
+            self.returns = self.leads = 0
+        returns = self.mode is Mode.RETURN
+        if self.turns <= self.design.model.order if returns else self.returns < MOST_RETURNS:
+            goes_on = not self.mode.steps and acts and size > ARRIVED * self.limit
+            if goes_on or size > ASTRAY * self.limit:
                 if not returns:
-                    state.turns, state.returns = 0, state.returns + 1
+                    self.turns, self.returns = 0, self.returns + 1
                 return Mode.RETURN
-        if state.mode is Mode.LEAD_BACK:
+        if self.mode is Mode.LEAD_BACK:
             # As long as it pulls the same way, and a quarter as hard, or y is not yet near.
-            least = 0.25 if size <= ARRIVED * state.limit else 0.0
-            return Mode.LEAD_BACK if pull * state.pull > least * state.pull**2 else Mode.HOLD
-        if size <= state.limit:
+            least = 0.25 if size <= ARRIVED * self.limit else 0.0
+            return Mode.LEAD_BACK if pull * self.pull > least * self.pull**2 else Mode.HOLD
+        if size <= self.limit:
             return Mode.HOLD
-        state.pull, state.leads = pull, state.leads + 1
+        self.pull, self.leads = pull, self.leads + 1
         return Mode.LEAD_BACK
 
     def pull_back(self, deviation: Sequence[float], most: float) -> float:
         """u - u* that brings y back gently; most: the largest there may be."""
-        pull = -dot(self._design.gentle, deviation)
+        pull = -dot(self.design.gentle, deviation)
         return min(max(pull, -most), most) if pull == pull else 0.0
 
     def stay(self, inverse: BacklashInverse) -> None:
         """Rest where v is."""
-        self.state.u_d, self.state.shrinkage = inverse.extreme, 0.0
+        self.target = inverse.extreme, 0.0
 
     def step(
         self, estimate: Estimate, ideal: float, noise: float, pull: float,
         inverse: BacklashInverse, begins: bool,
     ) -> None:
-        """Say where v is to rest, where that is better than to stay.
+        """Aim v at where it is to rest, where that is better than to stay.
 
         ideal: u*, with so much noise. begins: whether the mode has changed with this sample.
         """
-        state = self.state
         if begins:
             self.stay(inverse)
         if inverse.taking_up or inverse.side is Region.GAP:
             return  # still on its way, or nobody knows what u is
         engaged = estimate.c_l if inverse.side is Region.LEFT else estimate.c_r
         u = estimate.m * (inverse.v - engaged)
-        if state.mode is Mode.LEAD_BACK:
-            if begins or (u - ideal) * pull < 0.5 * pull * pull:  # too weak to bring y back
-                self._aim(ideal + pull, u, 0.0, inverse)
-            return
-        side_std = estimate.std_c_r if ideal > u else estimate.std_c_l
-        away, uncertain = abs(ideal - u), SHORT * side_std * estimate.m
-        # A step has to move x by a share of the tolerance, and to lessen what u is off.
-        if away * self._design.push > 0.25 * state.limit and away > max(1.5 * uncertain, noise):
-            self._aim(ideal, u, SHORT, inverse)
-
-    def _aim(self, u_d: float, u: float, shrinkage: float, inverse: BacklashInverse) -> None:
-        self.state.u_d, self.state.shrinkage = u_d, shrinkage
+        if self.mode is Mode.LEAD_BACK:
+            if not begins and (u - ideal) * pull >= 0.5 * pull * pull:
+                return  # strong enough to bring y back
+            u_d, shrinkage = ideal + pull, 0.0
+        else:
+            side_std = estimate.std_c_r if ideal > u else estimate.std_c_l
+            away, uncertain = abs(ideal - u), SHORT * side_std * estimate.m
+            # A step has to move x by a share of the tolerance, and to lessen what u is off.
+            if not (away * self.design.push > 0.25 * self.limit
+                    and away > max(1.5 * uncertain, noise)):
+                return
+            u_d, shrinkage = ideal, SHORT
+        self.target = u_d, shrinkage
         inverse.aim(u_d, Region.RIGHT if u_d > u else Region.LEFT)

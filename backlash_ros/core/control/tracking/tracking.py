@@ -16,7 +16,7 @@ from backlash_ros.core.control.protocol import Command, ControlInput, ControlStr
 from backlash_ros.core.control.tracking.design import TrackingDesign, Weights, better_design, design
 from backlash_ros.core.control.tracking.feedback import StateFeedback, shrunk_crossings
 from backlash_ros.core.control.tracking.rest import OFF, Rest
-from backlash_ros.core.control.tracking.trajectory import IdealTrajectory, TrajectoryState
+from backlash_ros.core.control.tracking.trajectory import IdealTrajectory
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.law import StateSource
 from backlash_ros.core.plant.backlash import Region
@@ -30,13 +30,9 @@ FADING = 0.8  # per sample, of what is handed over
 class HandOver:
     """Whoever takes over v, and whatever it takes it over with, v goes on from where it is.
 
-    Controllers restart, a rival leaves, gains of a better G or of other weights and other estimates
-    take over: each time what v stands for differs from the u_d that would have led to it. That
-    difference is added to u_d, and fades.
-
-    added: to the next u_d. due: the u_d that would have led to v, where somebody takes over with
-    the next sample. widens: whether it may lead u_d further than feedback may. leading: whether
-    the reference may have gone on while nobody followed it.
+    What v stands for then differs from the u_d that would have led to it: that is added to u_d, and
+    fades. due: that u_d, where somebody takes over with the next sample. widens: whether what is
+    added may lead u_d further than feedback may. leading: whether the reference may have gone on.
     """
 
     added: float = 0.0
@@ -48,11 +44,9 @@ class HandOver:
 class Tracking(ControlStructure):
     """u_d = u* - K (x - x*) - K_q (q - q*) around the ideal trajectory u*, x*, q* of G alone.
 
-    The trajectory is what the LQ preview controller does without backlash, for the reference r,
-    which is y_m delayed by the preview window: the delay is what the preview costs. Before the
-    first reference has passed the window r is the output at the start, so that nothing jumps.
-    Where the trajectory rests, v moves in single steps. shrinkage: standard deviations by which the
-    crossings are shrunk before they are inverted. noise_std: of y.
+    The trajectory is what the LQ preview controller does without backlash, for y_m delayed by the
+    preview window, before which it is the output at the start. Where it rests, v moves in single
+    steps. shrinkage: standard deviations by which the crossings are shrunk. noise_std: of y.
     """
 
     def __init__(
@@ -62,9 +56,7 @@ class Tracking(ControlStructure):
         self._weights, self._told_noise, self._design = weights, noise_std, beginning
         self.trajectory = IdealTrajectory(beginning)
         self.feedback = StateFeedback(beginning, shrinkage, noise_std)
-        self.rest = Rest(beginning)
-        self.hand_over = HandOver()
-        self._y_noise = NoiseLevel()
+        self.rest, self.hand_over, self._y_noise = Rest(beginning), HandOver(), NoiseLevel()
         self._moves = deque([0.0], maxlen=100)  # by which v moved of late, as sizes
         self._engaged_for = 0  # samples since v has crossed the gap
         # y, the covariance of x_hat and who knows both, of a command that the next one was not
@@ -73,7 +65,6 @@ class Tracking(ControlStructure):
 
     @property
     def _noise_std(self) -> float:
-        """Of y as it was configured, or as measured, where that is more."""
         return max(self._told_noise, self._y_noise.std)
 
     @property
@@ -88,10 +79,8 @@ class Tracking(ControlStructure):
         # Neither a turn soon nor larger moves of v than those of late, as far as references say.
         fastest, ahead = trust.slope * max(self._moves), plan.ahead[:foreseen + 1]
         rounding = 1e-9 * max(map(abs, ahead))
-        return all(
-            -rounding <= (after - before) * plan.side <= fastest + rounding
-            for before, after in pairwise(ahead)
-        )
+        return all(-rounding <= (after - before) * plan.side <= fastest + rounding
+                   for before, after in pairwise(ahead))
 
     # --- taking over ----------------------------------------------------------------------------
 
@@ -99,16 +88,14 @@ class Tracking(ControlStructure):
         """Take over the trajectory, and the model of G that it is one of."""
         if not isinstance(other, Tracking) or other.delay != self.delay:
             return
-        model = other._design.model
-        if model is not self._design.model:
-            self._use(design(model, self._weights))
+        if other._design.model is not self._design.model:
+            self._use(design(other._design.model, self._weights))
         self.trajectory.go_on_from(other.trajectory)
         self.feedback.go_on_from(other.feedback, state_known)
-        self.rest.state = replace(other.rest.state)
+        self.rest = replace(other.rest, design=self._design)
         self._moves, self._engaged_for = other._moves, other._engaged_for
         self._newest = other._newest
-        self.hand_over = HandOver(
-            due=self.trajectory.state.u, widens=not state_known, leading=not state_known)
+        self.hand_over = HandOver(0.0, self.trajectory.state.u, not state_known, not state_known)
 
     def redesign(self, model: StateModel) -> Callable[[], object | None]:
         """See `better_design`."""
@@ -125,20 +112,20 @@ class Tracking(ControlStructure):
     def _change_trajectory(self, source: StateSource) -> None:
         """Be where the trajectory in use would be, and let v go on from where it is."""
         trajectory, feedback = self.trajectory, self.feedback
+        if trajectory.references.empty:
+            return
         trajectory.replay()
-        if not trajectory.references.empty:
-            state, plan = replace(feedback.state), trajectory.state
-            deviation = feedback.deviation(source.x_hat, plan.x)
-            due = plan.u - feedback.u(deviation, False, self.rest.state.largest)[0]
-            feedback.state = state  # this was no sample
-            self.hand_over = HandOver(due=due, widens=True)
-            trajectory.advance()  # the plant is at the next sample when the next command is made
+        state, plan = replace(feedback.state), trajectory.state
+        deviation = feedback.deviation(source.x_hat, plan.x)
+        due = plan.u - feedback.u(deviation, False, self.rest.largest)[0]
+        feedback.state = state  # this was no sample
+        self.hand_over = HandOver(due=due, widens=True)
+        trajectory.advance()  # the plant is at the next sample when the next command is made
 
     def _use(self, chosen: TrackingDesign) -> None:
-        self._design = chosen
+        self._design = self.rest.design = chosen
         self.trajectory.use(chosen, self.trajectory.softness)
         self.feedback.use(chosen)
-        self.rest.use(chosen)
 
     # --- at every sample ------------------------------------------------------------------------
 
@@ -146,18 +133,17 @@ class Tracking(ControlStructure):
         """Return u_d and v = BI(u_d)."""
         y_m, y, estimate, source, crossing = inputs
         self.prepare()
-        feedback, trust, rest, x_cov = self.feedback, self.feedback.trust, self.rest, source.x_cov
-        references = self.trajectory.references
+        feedback, rest, x_cov, references = (
+            self.feedback, self.rest, source.x_cov, self.trajectory.references)
         first = references.empty
-        self._go_on(estimate, inverse)
-        plan = self._plan(y, y_m)
+        self._take_over(y, y_m, estimate, inverse)
+        plan = self.trajectory.take(y_m)
         deviation = feedback.deviation(source.x_hat, plan.x)
         feedback.begin(plan.u, estimate, first)
         turned = self.trajectory.turn(
-            self._noise_std, estimate.m * (estimate.c_r - estimate.c_l), inverse.direction_band,
-            crossing)
+            self._noise_std, feedback.gap_u, inverse.direction_band, crossing)
         correction, worth = feedback.u(
-            deviation, inverse.limited or inverse.taking_up, rest.state.largest)
+            deviation, inverse.limited or inverse.taking_up, rest.largest)
         noise = 4.0 * feedback.noise_u + plan.noise_band
         u_d = plan.aim - correction
         if feedback.knows_noise:
@@ -165,24 +151,30 @@ class Tracking(ControlStructure):
         added = self.hand_over.added
         self.hand_over.added *= FADING
         u_d += added
-        pull, before = rest.pull_back(deviation, feedback.most), rest.state.mode
+        pull, before = rest.pull_back(deviation, feedback.most), rest.mode
         spread = max(references.high, y_m) - min(references.low, y_m) - references.noise_spread
         mode = rest.decide(y, self._noise_std, references.window.item(0), spread, plan, deviation,
                            None if x_cov is None else feedback.noise.x_std, inverse.side, pull,
                            abs(correction) > noise)
-        if mode.steps:
+        side, crossings = inverse.side, feedback.trust.crossings
+        if not mode.steps:
+            side = self._side(turned, u_d, noise, inverse)
+        else:
             if x_cov is not None:
                 rest.step(estimate, plan.u, plan.noise_band, pull, inverse, mode is not before)
             elif not before.steps:
                 rest.stay(inverse)
-            side, u_d = None, rest.state.u_d
-            crossings = shrunk_crossings(estimate, rest.state.shrinkage, trust.known)
-        else:
-            side, crossings = self._side(turned, u_d, noise, inverse), trust.crossings
+            u_d = rest.target[0]
+            crossings = shrunk_crossings(estimate, rest.target[1], feedback.trust.known)
         # Whatever has made u_d: nothing leads it further from what the reference asks for.
         reach = feedback.reach + (abs(added) if self.hand_over.widens else 0.0)
         u_d = min(max(u_d, plan.u - reach), plan.u + reach)
-        v = self._invert(u_d, side, crossings, inverse)
+        side_before, v_before, slope = inverse.side, inverse.v, feedback.trust.slope
+        v = inverse.proceed(slope, *crossings) if mode.steps else \
+            inverse.follow(side, u_d, slope, *crossings)
+        self._moves.append(abs(v - v_before))
+        crosses = inverse.taking_up or inverse.side is not side_before
+        self._engaged_for = 0 if crosses else self._engaged_for + 1
         feedback.integrate(self._design.model.c * plan.x[0] - y, inverse.limited)
         self._newest = y, x_cov, source
         return Command(u_d, v, 0.0)
@@ -198,28 +190,25 @@ class Tracking(ControlStructure):
             if self.feedback.trust.full and self.trajectory.soften(self.feedback.gap_u):
                 self._change_trajectory(source)
 
-    def _go_on(self, estimate: Estimate, inverse: BacklashInverse) -> None:
-        """Take in the estimate, and v from whoever has made it until now."""
-        hand_over, feedback = self.hand_over, self.feedback
-        follows = not (self.rest.state.mode.steps or inverse.taking_up)
+    def _take_over(
+        self, y: float, y_m: float, estimate: Estimate, inverse: BacklashInverse,
+    ) -> None:
+        """Go on with this estimate, and with v and references from whoever has made v so far."""
+        hand_over, feedback, trajectory = self.hand_over, self.feedback, self.trajectory
+        follows = not (self.rest.mode.steps or inverse.taking_up)
         if feedback.take_estimate(estimate) and follows and hand_over.due is None:
             hand_over.due = inverse.extreme  # that led to v with the estimate before
         if hand_over.due is not None:
             stands_for = inverse.resume(feedback.trust.slope, *feedback.trust.crossings)
             if inverse.side is not Region.GAP:
-                hand_over.added += (stands_for - hand_over.due)
+                hand_over.added += stands_for - hand_over.due
             hand_over.due = None
-
-    def _plan(self, y: float, y_m: float) -> TrajectoryState:
-        """The trajectory at this sample, with the reference that came with it."""
-        trajectory, hand_over = self.trajectory, self.hand_over
         if trajectory.references.empty:
             # What may be noise is no distance to go: a loop at rest stays at rest.
             trajectory.begin(y_m if abs(y - y_m) <= OFF * self._noise_std else y)
         elif hand_over.leading:
             trajectory.lead_to(y_m)
         hand_over.leading = False
-        return trajectory.take(y_m)
 
     def _without_crossing(
         self, wanted: float, worth: float, noise: float, deviation: Sequence[float],
@@ -263,18 +252,3 @@ class Tracking(ControlStructure):
         # Where feedback turned before the trajectory does, that is no reason to turn again.
         band = plan.back + (noise if side is asked else 0.0)
         return Region(-side) if back > max(band, inverse.direction_band) else side
-
-    def _invert(
-        self, u_d: float, side: Region | None, crossings: tuple[float, float],
-        inverse: BacklashInverse,
-    ) -> float:
-        """Return v; side: line for u_d, None where v steps to rest."""
-        before, v_before, slope = inverse.side, inverse.v, self.feedback.trust.slope
-        if side is None:
-            v = inverse.proceed(slope, *crossings)
-        else:
-            v = inverse.follow(side, u_d, slope, *crossings)
-        self._moves.append(abs(v - v_before))
-        crosses = inverse.taking_up or inverse.side is not before
-        self._engaged_for = 0 if crosses else self._engaged_for + 1
-        return v

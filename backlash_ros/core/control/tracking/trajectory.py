@@ -14,27 +14,24 @@ from math import ceil, dist, isnan, nan
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.control.protocol import dot
-from backlash_ros.core.control.tracking.design import TrackingDesign
+from backlash_ros.core.control.tracking.design import TrackingDesign, dot
 from backlash_ros.core.control.tracking.reference_window import ReferenceWindow
 from backlash_ros.core.plant.backlash import Region
 
 Array = NDArray[np.float64]
 
-# Share of the u that the gap takes, by which noise of the references may move u*.
-QUIET = 0.02
+QUIET = 0.02  # share of the u that the gap takes, by which noise of the references may move u*
 
 
 @dataclass
 class TrajectoryState:
     """Where the trajectory is, and where it goes.
 
-    x: x*, shape (n,). q: q*. side: on which u* moves, GAP until it does. extreme: the furthest u*
-    in that direction, nan before there is one. decided: samples for which the side stays. turns_in:
-    samples until u* turns, or all that are known ahead. furthest: u* to which u is to go without
-    turning. ahead: u* from this sample on, as far as the references are known. moved: by how much
-    x* did last.
-    noise_band: how far the noise of the references may turn u*. noise: of u*, what is no turn.
+    x, q: x* (n,) and q*. side: on which u* moves, GAP until it does. extreme: the furthest u* in
+    that direction. decided: samples for which the side stays. turns_in: samples until u* turns, or
+    all that are known ahead. furthest: u* to which u is to go without turning. ahead: u* from this
+    sample on. moved: by how much x* did. noise_band: how far the noise of the references may turn
+    u*.
     """
 
     x: list[float]
@@ -47,7 +44,6 @@ class TrajectoryState:
     ahead: list[float] = field(default_factory=lambda: [0.0])
     moved: float = 0.0
     noise_band: float = 0.0
-    noise: float = 0.0
 
     @property
     def u(self) -> float:
@@ -63,18 +59,16 @@ class TrajectoryState:
     @property
     def back(self) -> float:
         """By how much u* has come back without having turned."""
-        return max((self.extreme - self.ahead[0]) * self.side, 0.0)
+        return max((self.extreme - self.u) * self.side, 0.0)
 
 
 class IdealTrajectory:
     """Follows the references, a sample at a time: `take`, `turn`, `prepare` for the next one."""
 
     def __init__(self, design: TrackingDesign) -> None:
-        self.state = TrajectoryState([0.0] * design.model.order)
+        self.state, plan = TrajectoryState([0.0] * design.model.order), design.plans[0]
         self.references = ReferenceWindow(
-            len(design.plans[0].references[0]) - 1, design.model.memory,
-            design.plans[0].noise_gains,
-        )
+            len(plan.references[0]) - 1, design.model.memory, plan.noise_gains)
         self.use(design)
 
     def use(self, design: TrackingDesign, softness: int = 0) -> None:
@@ -84,8 +78,7 @@ class IdealTrajectory:
         self._newest_gains: list[float] = self._plan.references[:, -1].tolist()
         self._due: list[float] | None = None  # u* ahead at the next sample, but for its reference
         self._transition: list[tuple[list[float], float]] = list(
-            zip(design.model.a.tolist(), design.model.b.tolist(), strict=True)
-        )
+            zip(design.model.a.tolist(), design.model.b.tolist(), strict=True))
 
     def go_on_from(self, other: IdealTrajectory) -> None:
         """Be where another trajectory of the same model is."""
@@ -111,13 +104,9 @@ class IdealTrajectory:
 
     def replay(self) -> None:
         """Be where this design would be, had it been in use as long as references are kept."""
-        references, state = self.references, self.state
-        if references.empty:
-            state.x = [0.0] * self._design.model.order
-            return
-        model = self._design.model
-        state.x, state.q = self._plan.replayed(model, references.all(), model.memory)
-        state.ahead = self._ahead(references.window, self._plan.references)
+        state, plan, references = self.state, self._plan, self.references
+        state.x, state.q = plan.replayed(self._design.model, references.all())
+        state.ahead = self._ahead(references.window, plan.references)
 
     def begin(self, r: float) -> None:
         """Rest at y = r."""
@@ -151,20 +140,20 @@ class IdealTrajectory:
         arrival = max(taken - 1, 0)
         # What moves y by less than its noise is no turn, unless it is a hundredth of the gap.
         least = min(noise_std / self._design.push_ahead, 0.01 * gap_u)
-        state.noise = max(least, state.noise_band)
+        noise = max(least, state.noise_band)
         if state.decided > 0:
             state.decided -= 1
-        elif state.side is Region.GAP:
+        elif before is Region.GAP:
             moves = [u - state.extreme for u in ahead]
             if max(map(abs, moves[:arrival + 1])) > least:
-                first = next((move for move in moves if abs(move) > state.noise), 0.0)
+                first = next((move for move in moves if abs(move) > noise), 0.0)
                 state.side = Region((first > 0.0) - (first < 0.0))
         else:
-            peak = _turn(ahead, state, band, taken)
+            peak = _turn(ahead, state.extreme, before, noise, band, taken)
             turns_in = len(ahead) if peak is None else max(peak, 0)
             later = ahead[min(arrival, len(ahead) - 1)]
-            if peak is not None and peak < taken and (later - state.extreme) * state.side <= 0.0:
-                state.side = Region(-state.side)
+            if peak is not None and peak < taken and (later - state.extreme) * before <= 0.0:
+                state.side = Region(-before)
                 state.extreme, state.decided = later, arrival
         if (ahead[0] - state.extreme) * state.side > 0.0 and not state.decided:
             state.extreme = ahead[0]
@@ -209,16 +198,17 @@ class IdealTrajectory:
         return plan
 
 
-def _turn(ahead: list[float], state: TrajectoryState, band: float, shortest: int) -> int | None:
+def _turn(
+    ahead: list[float], extreme: float, side: Region, noise: float, band: float, shortest: int,
+) -> int | None:
     """Where u* is furthest before it turns: samples from now on, -1 where that was before.
 
     It turns where it comes back by more than noise, and by more than the band as well, or for as
     long as references are known; for more than the shortest time. None where it does not.
     """
-    extreme, noise = state.extreme, state.noise
     peak, furthest_back, turned = -1, 0.0, False
     for j, u in enumerate(ahead):
-        beyond = (u - extreme) * state.side
+        beyond = (u - extreme) * side
         if beyond <= 0.0:
             furthest_back = min(furthest_back, beyond)
             turned = turned or beyond < -noise
