@@ -6,7 +6,6 @@ import sys
 import time
 from collections import deque
 from collections.abc import Mapping
-from concurrent.futures import Future
 from functools import partial
 from itertools import cycle
 from math import isfinite, nan
@@ -41,8 +40,7 @@ from backlash_ros.core.loop.sample_counter import (
     kept_outputs,
 )
 from backlash_ros.core.parameters import CONTROLLER, ParameterError, Parameters
-from backlash_ros.nodes.control.diagnosis import neighbours_of
-from backlash_ros.nodes.control.joint import Joint
+from backlash_ros.nodes.control.joint import Joint, neighbours_of
 from backlash_ros.nodes.control.publishing import StepPublisher
 from backlash_ros.nodes.control.rivals import RivalWatch
 from backlash_ros.nodes.control.services import offer_services, refuse_unfit_transitions
@@ -66,10 +64,8 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
         p = self.settings
         check_style(p)
         for joint in p.joint_names:
-            # Whatever is wrong with the parameters ends the process before it takes part in
-            # anything.
             own = p.of_joint(joint)
-            build_controller(own)
+            build_controller(own)  # raises ParameterError before the node takes part in anything
             for warning in warnings_of(own, with_reference=False):
                 self.log.warning(f'{joint}: {warning}' if joint else warning)
         self.active = False
@@ -100,56 +96,43 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
             self._on_reference, KEPT_QOS if p.lockstep else 1, polled=not p.lockstep
         )
         self.joints += [Joint(self, name, p.of_joint(name), self._io) for name in p.joint_names]
-        offer_services(
-            self, lambda: self.configured, self.save_estimates,
-            lambda: ', '.join(joint.p.estimates.file for joint in self.joints),
-        )
+        offer_services(self, self.joints)
         self.let_parameters_change(self._check_change, self._take_up, lambda: self.loops is None)
-        # One joint at a time: all at once would hold up a command.
-        turn = cycle(self.joints)
+        turns = cycle(self.joints)
 
         def look_and_tell() -> None:
             self._steps.look()
-            self._diagnose(next(turn))
+            self._diagnose(next(turns))  # one at a time: all at once would hold up a command
 
         self.every(DIAGNOSTICS_PERIOD_S / len(self.joints), look_and_tell)
         if p.lockstep:
             self.create_subscription(Clock, topics.CLOCK, self._on_clock, KEPT_QOS)
         else:
             self.every(0.1, self._look_for_silence)
-        self._announce()
+        to, name = self._io.topics, self.resolve_topic_name
+        self.log.info(
+            f'started: {name(to.output)} and {name(to.reference)} in, {name(to.control)} out'
+            f'{" for joints " if p.joints else ""}{", ".join(p.joints)}, '
+            f'sample_period {p.sample_period:g} s ({1.0 / p.sample_period:.4g} Hz); waits for '
+            + (f'{to.reference} and {to.output}' if p.autostart else
+               f'ros2 lifecycle set {self.get_fully_qualified_name()} configure')
+        )
+        exact = [joint for joint in p.joint_names if takes_model_as_exact(p.of_joint(joint))]
+        if exact:
+            self.log.info(
+                f'plant.uncertainty{" of " if exact[0] else ""}{", ".join(exact)} is 0: G is taken '
+                'as exact, which no data can check. Where it is not, estimates are off by more '
+                'than their deviations: 0.2 allows for time constants that are 20 % off'
+            )
         if p.autostart:
             untyped: Any = self
             untyped.trigger_configure()
             untyped.trigger_activate()
 
-    def _announce(self) -> None:
-        p, to, name = self.settings, self._io.topics, self.resolve_topic_name
-        joints = f'joints {", ".join(p.joint_names)}: ' if p.joints else ''
-        self.log.info(
-            f'started: {joints}{name(to.output)} and {name(to.reference)} in, {name(to.control)} '
-            f'out, sample_period {p.sample_period:g} s ({1.0 / p.sample_period:.4g} Hz); '
-            + (f'waits for {to.reference} and {to.output}' if p.autostart
-               else 'autostart is false: waits for '
-                    f'ros2 lifecycle set {self.get_fully_qualified_name()} configure')
-        )
-        exact = [joint for joint in p.joint_names if takes_model_as_exact(p.of_joint(joint))]
-        if exact:
-            of = f' of {", ".join(exact)}' if exact[0] else ''
-            self.log.info(
-                f'plant.uncertainty{of} is 0: G is taken as exact, which no data can check. Where '
-                'it is not, estimates are off by more than their deviations: 0.2 allows for time '
-                'constants that are 20 % off'
-            )
-
     @property
     def configured(self) -> list[ControlLoop]:
         """The loops, none while there are none."""
         return [] if self.loops is None else list(self.loops.loops)
-
-    def save_estimates(self) -> list[Future[str]]:
-        """Begin to save what is worth it; each result says why it failed, empty if it did not."""
-        return [saved for joint in self.joints if (saved := joint.save()) is not None]
 
     # --- the life cycle --------------------------------------------------------------------------
 
@@ -165,7 +148,13 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
             self.log.error(str(error))
             return TransitionCallbackReturn.FAILURE
         for joint in self.joints:
-            joint.begin(self.loops.by_name[joint.name], before[joint.name])
+            joint.loop, e = self.loops.by_name[joint.name], before[joint.name]
+            joint.model.publish(joint.loop, joint.p)
+            if e.learned:
+                self.log.info(
+                    f'going on with the estimates in {joint.p.estimates.file}: m={e.m:.6g}, '
+                    f'c_r={e.c_r:.6g}, c_l={e.c_l:.6g}'
+                )
         return TransitionCallbackReturn.SUCCESS
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -225,7 +214,8 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
             self.active = False
             if any(loop.statistics.used for loop in loops.loops):
                 # Before a ramp: whoever stops this process may not wait for its end.
-                self.save_estimates()
+                for joint in self.joints:
+                    joint.save()
                 loops.end(self.settings.on_stop)
                 self._send_last(loops)
                 for joint in self.joints:
@@ -241,7 +231,8 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
 
         So it does at a SIGTERM that comes meanwhile: whoever sends it will kill the process next.
         """
-        told, longest_s, step_s = time.monotonic(), self.settings.timeout.ramp, self._step_s
+        p, told = self.settings, time.monotonic()
+        longest_s, step_s = p.timeout.ramp, max(p.sample_period, 1e-3)
         deadline, cut_short = told + longest_s, ''
         while loops.send_next():
             if not cut_short:
@@ -260,14 +251,12 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
                 self._diagnose()  # so that who stands down does not take this node for gone
         self._io.publisher.wait_for_all_acked(Duration(nanoseconds=100_000_000))
 
-    @property
-    def _step_s(self) -> float:
-        """Between two commands that end the loop."""
-        return max(self.settings.sample_period, 1e-3)
-
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         for joint in self.joints:
-            joint.end()
+            if joint.loop is not None:
+                joint.loop.core.close()
+                joint.v = joint.loop.v if joint.loop.knows_v else joint.v
+            joint.loop = None
         self.loops = None
         self._diagnose()
         return TransitionCallbackReturn.SUCCESS
@@ -346,7 +335,9 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
         """Use the settings, which have changed."""
         p = self.settings
         for joint in self.joints:
-            joint.take_up(p.of_joint(joint.name))
+            joint.p = p.of_joint(joint.name)
+            if joint.loop is not None:
+                joint.loop.take_up(joint.p)
         if self.loops is None and p.sample_period != before.sample_period:
             self._counter = SampleCounter(p.sample_period)
         self._mind_rivals()
@@ -382,7 +373,8 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
                 joint.save()
         if loops.give_up_silent():
             if self._ending is None:
-                self._ending = self.every(self._step_s, self._send_next)
+                step_s = max(self.settings.sample_period, 1e-3)
+                self._ending = self.every(step_s, self._send_next)
             self._diagnose()
 
     def _send_next(self) -> None:

@@ -1,4 +1,4 @@
-"""One joint of the controller: its loop, and what is said and kept of it."""
+"""One joint of the controller: its loop, what /diagnostics says of it, and what is kept."""
 
 from __future__ import annotations
 
@@ -6,37 +6,35 @@ import time
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
-from math import isfinite
+from math import isfinite, isnan
 from pathlib import Path
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.qos import QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from backlash_ros.core.assembly import build_controller, first_guess
-from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.estimates_file import save_estimate, worth_saving
+from backlash_ros.core.loop import diagnosis
 from backlash_ros.core.loop.control_loop import ControlLoop, Driver
-from backlash_ros.core.loop.diagnosis import (
-    OF_MESSAGES,
-    Finding,
-    Level,
-    Neighbours,
-    figures_of_loop,
-    findings_of,
-)
 from backlash_ros.core.loop.loop_statistics import Lately
 from backlash_ros.core.loop.sample_counter import Timing
 from backlash_ros.core.parameters import NOISE, ParameterError, Parameters
-from backlash_ros.nodes.control.diagnosis import counts_of, details_of, missing_joint, values_of
+from backlash_ros.core.simulation.run_record import stated_deviations
 from backlash_ros.nodes.control.publishing import ModelPublisher
-from backlash_ros.nodes.runtime.driver_io import DriverIo
-from backlash_ros.nodes.runtime.messages import DiagnosticsPublisher
+from backlash_ros.nodes.control.rivals import name_of
+from backlash_ros.nodes.runtime.driver_io import DriverIo, output_qos
+from backlash_ros.nodes.runtime.messages import DEPTH, DiagnosticsPublisher
 from backlash_ros.nodes.runtime.process import ProcessNode
 
 
 class Joint:
     """What the controller has of each joint; a single one is nameless.
 
-    p: its parameters. loop: None while the node is unconfigured. v: the command that acts as far as
-    this node can know, None if it cannot. told: the state that /diagnostics has. saved_at: when
-    estimates were saved last, on the steady clock [s].
+    loop: None while the node is unconfigured. v: the command that acts as far as this node can
+    know, None if it cannot. told: the state that /diagnostics has. saved_at: when estimates were
+    saved last, on the steady clock [s].
     """
 
     def __init__(self, node: ProcessNode, name: str, p: Parameters, io: DriverIo) -> None:
@@ -75,24 +73,6 @@ class Joint:
         """Of which every change is worth a message in /diagnostics."""
         return self.loop and (self.loop.phase, self.loop.estimate.status)
 
-    def begin(self, loop: ControlLoop, before: Estimate) -> None:
-        """Take a new loop."""
-        self.loop = loop
-        self.model.publish(loop, self.p)
-        if before.learned:
-            self._node.log.info(
-                f'going on with the estimates in {self.p.estimates.file}: m={before.m:.6g}, '
-                f'c_r={before.c_r:.6g}, c_l={before.c_l:.6g}'
-            )
-
-    def end(self) -> None:
-        """Give the loop up, but remember its v."""
-        if self.loop is not None:
-            self.loop.core.close()
-            if self.loop.knows_v:
-                self.v = self.loop.v
-        self.loop = None
-
     def check_change(self, p: Parameters) -> None:
         """Raise ParameterError for values that the running loop cannot take up."""
         build_controller(p, first_guess(p))
@@ -102,12 +82,6 @@ class Joint:
                 NOISE, p[NOISE], f'is not taken up live by {p.estimator.law}',
                 'clean the node up, set it, and configure again',
             )
-
-    def take_up(self, p: Parameters) -> None:
-        """Use other values."""
-        self.p = p
-        if self.loop is not None:
-            self.loop.take_up(p)
 
     def save(self) -> Future[str] | None:
         """Begin to save the estimates; None where there is nothing worth it, or nowhere to.
@@ -131,28 +105,43 @@ class Joint:
         return self._writer.submit(write)
 
     def diagnose(
-        self, around: Neighbours, timing: Timing, claim: Mapping[str, object], active: bool,
+        self, around: diagnosis.Neighbours, timing: Timing, claim: Mapping[str, object],
+        active: bool,
     ) -> None:
         """Publish what is going on to /diagnostics. claim: what the node says in each of them."""
-        loop, p, publish = self.loop, self.p, self._diagnostics.publish
+        loop, p, io, publish = self.loop, self.p, self._io, self._diagnostics.publish
+        level, finding_of = diagnosis.Level, diagnosis.Finding
         if loop is None:
-            publish(Finding(Level.OK, 'unconfigured', 'unconfigured'), claim)
+            publish(finding_of(level.OK, 'unconfigured', 'unconfigured'), claim)
             return
         values = {**values_of(loop, timing), **claim}
         if not active:
-            text = f'inactive: no {self._io.topics.control} is published'
-            publish(Finding(Level.OK, 'inactive', text), values)
+            text = f'inactive: no {io.topics.control} is published'
+            publish(finding_of(level.OK, 'inactive', text), values)
             return
         gained = self._lately.gained(loop.counted, time.monotonic())
-        figures = figures_of_loop(loop, p, timing, gained, around)
-        findings = [*missing_joint(self._io, self.name, p), *findings_of(figures)]
+        findings = diagnosis.findings_of(
+            diagnosis.figures_of_loop(loop, p, timing, gained, around)
+        )
+        if io.skipped[self.name] >= 5:
+            text = f'{io.topics.output} has no {p.io.field} of joint {p.io.joint!r} but ' \
+                f'{io.seen}: set io.joint, io.field'
+            findings.insert(0, finding_of(level.ERROR, 'joint', text[:diagnosis.LONGEST_TEXT]))
         # The likeliest cause at the highest level that was found.
-        worst = max(findings, key=lambda finding: finding.level > Level.OK)
+        worst = max(findings, key=lambda finding: finding.level > level.OK)
         worst = worst._replace(level=max(finding.level for finding in findings))
+        details = {f'finding {i}': finding.text for i, finding in enumerate(findings, start=1)}
+        for topic, what in zip(around[:3], ('published', 'published', 'heard'), strict=True):
+            details[f'{topic.name} {what} by'] = ', '.join(
+                peer.name + (f' ({peer.kind}: does not fit)' if peer.unfit else '')
+                for peer in topic.peers
+            ) or 'nobody'
+        if around.rivals:
+            details[f'{around.control.name} also published by'] = ', '.join(around.rivals)
         # What is true of all joints the first one says in the log.
         first = self._node.settings.joint_names[0]
-        logs = self.name == first or worst.kind not in OF_MESSAGES
-        publish(worst, {**details_of(findings, around), **values}, logs)
+        logs = self.name == first or worst.kind not in diagnosis.OF_MESSAGES
+        publish(worst, {**details, **values}, logs)
 
     def close(self) -> None:
         """Wait until everything is written, and say in the log what was counted."""
@@ -163,3 +152,78 @@ class Joint:
                 if count or key == 'samples'
             )
             self._node.log.info(f'{self.name}: {said}' if self.name else said)
+
+
+def counts_of(loop: ControlLoop) -> dict[str, int]:
+    n = loop.statistics
+    return {
+        'samples': n.used, 'lost': n.lost, 'of these never sent': n.unsent, 'late': n.late,
+        'non-finite dropped': n.dropped,
+        'repeated, too early or from a second driver': n.extra,
+        'interruptions': n.interruptions, 'limits hit': n.limited,
+        'before the first reference': n.without_reference, 'without applied_control': n.unreported,
+    }
+
+
+def values_of(loop: ControlLoop, timing: Timing) -> dict[str, object]:
+    """Counts, estimates and what tells how well the loop runs."""
+    e, law, swing = loop.estimate, loop.core.estimator, loop.statistics.swing()
+    gap, report, redesign = e.c_r - e.c_l, law.report, loop.core.redesign
+    p50_ms, p99_ms = loop.statistics.latencies_ms(0.5, 0.99)
+    mean_s = timing.intervals_s[1] if isnan(timing.period.mean) else timing.period.mean
+    return {
+        **counts_of(loop), 'state': e.status.word if law.adapting else 'held',
+        **({} if law.learned_model is None else {
+            'noise: learned / told': report.noise_ratio,
+            'unexplained motion / (m * gap)': report.unexplained,
+            'samples that wait for a fit': report.waiting, 'outliers': report.outliers,
+            'commands found to be late': report.reattributed, 'failed fits': report.failed_fits,
+            'failed designs': redesign.failed if redesign else 0,
+            'processes for fits that died': loop.executor.restarts,
+        }),
+        'm': e.m, 'c_r': e.c_r, 'c_l': e.c_l, 'f': e.f,
+        **dict(zip(('std_m', 'std_c_r', 'std_c_l'), stated_deviations(e), strict=True)),
+        'learning': law.adapting, 'compensating': loop.core.compensating,
+        'using applied_control': loop.commands.trust.trusted,
+        # Above 1 the gap is crossed, without which nothing can be learned of it.
+        'excitation: swing of v / gap': swing / gap if gap > 0.0 else swing,
+        'rate [Hz]': 0.0 if isnan(mean_s) or mean_s <= 0.0 else 1.0 / mean_s,
+        'latency p50 [ms]': p50_ms, 'latency p99 [ms]': p99_ms,
+    }
+
+
+def neighbours_of(
+    node: Node, io: DriverIo, p: Parameters, rivals: tuple[str, ...],
+) -> diagnosis.Neighbours:
+    """Who is on the topics of the controller. rivals: who else publishes v."""
+    to, own, publishers = io.topics, node.get_fully_qualified_name(), \
+        node.get_publishers_info_by_topic
+    # As the middleware has it: rclpy keeps what was asked for, with zeros for "no limit".
+    offered = [i.qos_profile for i in publishers(to.control) if name_of(i) == own]
+    heard = node.get_subscriptions_info_by_topic(to.control) if offered else []
+    return diagnosis.Neighbours(
+        _peers_on(to.output, to.output_type, publishers(to.output), wanted=output_qos(p, DEPTH)),
+        _peers_on(to.reference, to.reference_type, publishers(to.reference),
+                  wanted=io.reference_qos),
+        _peers_on(to.control, to.control_type, heard, *offered[:1]), rivals,
+    )
+
+
+def _peers_on(
+    topic: str, message_type: type[Any], infos: list[TopicEndpointInfo],
+    offered: QoSProfile | None = None, wanted: QoSProfile | None = None,
+) -> diagnosis.TopicFigures:
+    """Who is on a topic, and what the node itself offers to them or wants of them."""
+    wanted_type = f'{message_type.__module__.split(".")[0]}/msg/{message_type.__name__}'
+
+    def peer(info: TopicEndpointInfo) -> diagnosis.Peer:
+        offers, wants, unfit = offered or info.qos_profile, wanted or info.qos_profile, ''
+        if info.topic_type != wanted_type:
+            unfit = 'type'
+        elif qos_check_compatible(offers, wants)[0] == QoSCompatibility.ERROR:
+            unreliable = offers.reliability == ReliabilityPolicy.BEST_EFFORT \
+                and wants.reliability == ReliabilityPolicy.RELIABLE
+            unfit = 'reliability' if unreliable else 'qos'
+        return diagnosis.Peer(name_of(info), str(info.topic_type).rsplit('/', 1)[-1], unfit)
+
+    return diagnosis.TopicFigures(topic, message_type.__name__, tuple(map(peer, infos)))

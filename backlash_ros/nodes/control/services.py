@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future as Writing
 from typing import Any, cast
 
 from lifecycle_msgs.srv import ChangeState
@@ -14,6 +13,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from backlash_ros.core.estimates_file import worth_saving
 from backlash_ros.core.loop.control_loop import ControlLoop
+from backlash_ros.nodes.control.joint import Joint
 
 
 def refuse_unfit_transitions(node: Node) -> None:
@@ -32,15 +32,8 @@ def refuse_unfit_transitions(node: Node) -> None:
     service.callback = checked
 
 
-def offer_services(
-    node: Node, loops_of: Callable[[], Sequence[ControlLoop]],
-    save_estimates: Callable[[], list[Writing[str]]], files: Callable[[], str],
-) -> None:
-    """Create ~/freeze_adaptation, ~/enable_compensation, ~/reset_estimates, ~/save_estimates.
-
-    loops_of: the loops, none while there are none. save_estimates: begins to save what is worth
-    it; each result says why it failed, empty if it did not. files: where to, empty for nowhere.
-    """
+def offer_services(node: Node, joints: Sequence[Joint]) -> None:
+    """Create ~/freeze_adaptation, ~/enable_compensation, ~/reset_estimates, ~/save_estimates."""
     unconfigured = 'the controller is unconfigured: configure it first'
 
     def offer(
@@ -49,7 +42,8 @@ def offer_services(
     ) -> None:
         """Act upon all loops; the bool, and which text it is done with, is what was asked for."""
         def serve(request: Any, response: Any) -> Any:
-            loops, wanted = loops_of(), getattr(request, 'data', True)
+            loops = [joint.loop for joint in joints if joint.loop is not None]
+            wanted = getattr(request, 'data', True)
             for loop in loops:
                 act(loop, wanted)
             response.success = bool(loops)
@@ -60,16 +54,17 @@ def offer_services(
         node.create_service(kind, name, serve)
 
     async def save(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if not loops_of():
+        loops = [joint.loop for joint in joints if joint.loop is not None]
+        if not loops:
             response.message = unconfigured
-        elif not files():
+        elif not any(joint.p.estimates.file for joint in joints):
             response.message = 'estimates.file is empty, so there is nowhere to save: start with ' \
                 '-p estimates.file:=PATH, or set it while unconfigured'
-        elif not any(worth_saving(loop.estimate) for loop in loops_of()):
+        elif not any(worth_saving(loop.estimate) for loop in loops):
             response.message = 'nothing was learned yet'
         else:
             reasons = []
-            for writing in save_estimates():
+            for writing in filter(None, [joint.save() for joint in joints]):
                 # The loop goes on while the disk takes its time.
                 written: Future = Future()
                 writing.add_done_callback(written.set_result)
@@ -77,7 +72,8 @@ def offer_services(
                 reasons.append(writing.result())
             why = '; '.join(filter(None, reasons))
             response.success = not why
-            response.message = why or f'saved in {files()}'
+            files = ', '.join(joint.p.estimates.file for joint in joints)
+            response.message = why or f'saved in {files}'
         return response
 
     offer(SetBool, '~/freeze_adaptation', lambda loop, frozen: loop.adapt(not frozen),
