@@ -97,7 +97,6 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
         )
         self.joints += [Joint(self, name, p.of_joint(name), self._io) for name in p.joint_names]
         offer_services(self, self.joints)
-        self.let_parameters_change(self._check_change, self._take_up, lambda: self.loops is None)
         turns = cycle(self.joints)
 
         def look_and_tell() -> None:
@@ -327,12 +326,14 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
 
     # --- what happens besides --------------------------------------------------------------------
 
-    def _check_change(self, p: Parameters) -> None:
+    def is_configured(self) -> bool:
+        return self.loops is not None
+
+    def check_change(self, p: Parameters) -> None:
         for joint in self.joints:
             joint.check_change(p.of_joint(joint.name))
 
-    def _take_up(self, before: Parameters) -> None:
-        """Use the settings, which have changed."""
+    def take_up(self, before: Parameters) -> None:
         p = self.settings
         for joint in self.joints:
             joint.p = p.of_joint(joint.name)

@@ -16,7 +16,7 @@ from std_msgs.msg import Float64
 
 from backlash_ros import topics
 from backlash_ros.core.loop.command_history import HeldControl
-from backlash_ros.core.parameters import PLANT
+from backlash_ros.core.parameters import PLANT, Parameters
 from backlash_ros.core.scenario import build_plant
 from backlash_ros.nodes.runtime import messages
 from backlash_ros.nodes.runtime.executor import PromptExecutor
@@ -57,7 +57,6 @@ class PlantNode(ProcessNode):
         )
         self._truth_rows: list[tuple[float, ...]] = []  # that wait until y has left
         self.listen(Float64, topics.CONTROL, self._on_control, 1)
-        self.let_parameters_change(build_plant, lambda _: self._plant.change(self.settings))
         name, outputs, wanted = \
             self.resolve_topic_name, topics.PLANT_OUTPUT, p.wait_for_subscribers
         self.log.info(
@@ -75,6 +74,12 @@ class PlantNode(ProcessNode):
             for topic in (topics.APPLIED_CONTROL, topics.PLANT_OUTPUT)
         )
         return output >= wanted and min(self._truth.listeners, applied) >= int(wanted > 1)
+
+    def check_change(self, p: Parameters) -> None:
+        build_plant(p)
+
+    def take_up(self, before: Parameters) -> None:
+        self._plant.change(self.settings)
 
     def work(self, executor: PromptExecutor) -> None:
         while not (self._started or self.stopping):

@@ -81,8 +81,8 @@ class RecorderNode(ProcessNode):
                 topic, kind, messages.KEPT_QOS if topic == topics.MODEL else RECORDER_DEPTH
             ) for topic, kind in {
                 **dict.fromkeys(topics.LABELS_OF, Float64MultiArray),
-                topics.DIAGNOSTICS: DiagnosticArray, to.reference: to.reference_type,
-                to.applied: to.applied_type, to.control: to.control_type,
+                topics.DIAGNOSTICS: DiagnosticArray,
+                **{topic: to.types[topic] for topic in (to.reference, to.applied, to.control)},
             }.items()
         }
         if p.lockstep:
@@ -94,7 +94,7 @@ class RecorderNode(ProcessNode):
         wanted = (topics.ESTIMATES, topics.SIGNALS, *truth, to.reference, to.control)
 
         def start() -> None:
-            self._record(to.output, to.output_type, output_qos(p, RECORDER_DEPTH))
+            self._record(to.output, to.types[to.output], output_qos(p, RECORDER_DEPTH))
             emit('ready')
 
         self.call_when(
@@ -185,11 +185,9 @@ class RecorderNode(ProcessNode):
             message_type, topic, partial(self._on_message, topic), qos, raw=True
         )
         channel = self._channels[topic] = RecordedTopic(str(subscription.topic_name))
-        # As bags know a type: std_msgs/msg/Float64.
-        kind = f'{message_type.__module__.split(".")[0]}/msg/{message_type.__name__}'
 
         def announce(bag: Bag) -> None:
-            channel.connection = bag.add_topic(channel.name, kind)
+            channel.connection = bag.add_topic(channel.name, messages.name_of_type(message_type))
 
         self._with_bag(announce)
         return subscription

@@ -6,10 +6,7 @@ import sys
 import time
 from collections.abc import Mapping
 from functools import partial
-from math import inf
-from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
@@ -41,12 +38,10 @@ class ReferenceNode(ProcessNode):
         self._offset_s = 0.0  # keeps the phase where the frequency changes
         self._newest = 0  # sample that was published last
         self._started = False
-        self._loop_runs_at = inf  # since then, as the controller tells [s]
         self._io = DriverIo(self, p)
         self._output = self.create_publisher(
             Float64, topics.REFERENCE, messages.KEPT_QOS if p.lockstep else messages.DEPTH
         )
-        self.let_parameters_change(build_reference, self._take_up)
         name, awaited = self.resolve_topic_name, \
             f'{p.wait_for_subscribers} subscribers of {topics.REFERENCE}'
         self.log.info(
@@ -76,8 +71,7 @@ class ReferenceNode(ProcessNode):
     def _follow(self, executor: PromptExecutor) -> None:
         """Publish y_m half a period after each output, by the own clock where none comes.
 
-        In between the process sleeps: woken by each output it would take the processor from the
-        controller, which has to answer it.
+        Woken by each output, the process would take the processor from the controller.
         """
         p, now = self.settings, time.monotonic()
         counter = SampleCounter(p.sample_period)
@@ -92,24 +86,11 @@ class ReferenceNode(ProcessNode):
                 pace.hear(counter.index, messages.arrival_ns(output.received_ns) * 1e-9)
 
         outputs = self._io.listen(hear, depth=1, polled=True)
-        diagnostics = self.listen(
-            DiagnosticArray, topics.DIAGNOSTICS, self._hear_diagnostics, 10, polled=True
-        )
         serve_at = now
         while not self.stopping:
             if now >= serve_at:
                 executor.spin_once(timeout_sec=0.0)
                 serve_at = now + 0.05  # between two looks at signals and requests
-                if pace.waits:
-                    serve_polled(diagnostics)
-                    # Fast DDS may miss a process of another machine for good that starts at the
-                    # same moment.
-                    if now > self._loop_runs_at + 0.5:
-                        pace.waits = False
-                        self.log.warning(
-                            f'{self._io.topics.output} is not heard here, but by the controller: '
-                            'y_m goes by the own clock; start the driver some seconds before'
-                        )
             if pace.listens(now):
                 serve_polled(outputs)
                 now = time.monotonic()
@@ -121,16 +102,10 @@ class ReferenceNode(ProcessNode):
             time.sleep(max(min(wake_at, serve_at) - now, 0.0))
             now = time.monotonic()
 
-    def _hear_diagnostics(self, message: DiagnosticArray, info: dict[str, Any]) -> None:
-        """Note when the controller of this loop has used samples."""
-        loop = self.settings.io.joint or self.resolve_topic_name(self._io.topics.control)
-        if any(
-            value.key == 'samples' and value.value != '0'
-            for status in message.status if status.hardware_id == loop for value in status.values
-        ):
-            self._loop_runs_at = min(self._loop_runs_at, time.monotonic())
+    def check_change(self, p: Parameters) -> None:
+        build_reference(p)
 
-    def _take_up(self, before: Parameters) -> None:
+    def take_up(self, before: Parameters) -> None:
         """Use another signal from the next sample on; a sine goes on without a jump."""
         self._signal = build_reference(self.settings)
         t, self._offset_s = self._newest * before.sample_period + self._offset_s, 0.0

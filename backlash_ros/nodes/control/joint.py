@@ -8,7 +8,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
 from math import isfinite, isnan
 from pathlib import Path
-from typing import Any
 
 from rclpy.node import Node
 from rclpy.qos import QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
@@ -24,8 +23,8 @@ from backlash_ros.core.parameters import NOISE, ParameterError, Parameters
 from backlash_ros.core.simulation.run_record import stated_deviations
 from backlash_ros.nodes.control.publishing import ModelPublisher
 from backlash_ros.nodes.control.rivals import name_of
-from backlash_ros.nodes.runtime.driver_io import DriverIo, output_qos
-from backlash_ros.nodes.runtime.messages import DEPTH, DiagnosticsPublisher
+from backlash_ros.nodes.runtime.driver_io import DriverIo, DriverTopics, output_qos
+from backlash_ros.nodes.runtime.messages import DEPTH, DiagnosticsPublisher, name_of_type
 from backlash_ros.nodes.runtime.process import ProcessNode
 
 
@@ -202,19 +201,18 @@ def neighbours_of(
     offered = [i.qos_profile for i in publishers(to.control) if name_of(i) == own]
     heard = node.get_subscriptions_info_by_topic(to.control) if offered else []
     return diagnosis.Neighbours(
-        _peers_on(to.output, to.output_type, publishers(to.output), wanted=output_qos(p, DEPTH)),
-        _peers_on(to.reference, to.reference_type, publishers(to.reference),
-                  wanted=io.reference_qos),
-        _peers_on(to.control, to.control_type, heard, *offered[:1]), rivals,
+        _peers_on(to, to.output, publishers(to.output), wanted=output_qos(p, DEPTH)),
+        _peers_on(to, to.reference, publishers(to.reference), wanted=io.reference_qos),
+        _peers_on(to, to.control, heard, *offered[:1]), rivals,
     )
 
 
 def _peers_on(
-    topic: str, message_type: type[Any], infos: list[TopicEndpointInfo],
+    to: DriverTopics, topic: str, infos: list[TopicEndpointInfo],
     offered: QoSProfile | None = None, wanted: QoSProfile | None = None,
 ) -> diagnosis.TopicFigures:
     """Who is on a topic, and what the node itself offers to them or wants of them."""
-    wanted_type = f'{message_type.__module__.split(".")[0]}/msg/{message_type.__name__}'
+    wanted_type = name_of_type(to.types[topic])
 
     def peer(info: TopicEndpointInfo) -> diagnosis.Peer:
         offers, wants, unfit = offered or info.qos_profile, wanted or info.qos_profile, ''
@@ -226,4 +224,4 @@ def _peers_on(
             unfit = 'reliability' if unreliable else 'qos'
         return diagnosis.Peer(name_of(info), str(info.topic_type).rsplit('/', 1)[-1], unfit)
 
-    return diagnosis.TopicFigures(topic, message_type.__name__, tuple(map(peer, infos)))
+    return diagnosis.TopicFigures(topic, to.types[topic].__name__, tuple(map(peer, infos)))

@@ -32,36 +32,30 @@ from backlash_ros.nodes.runtime.process import ProcessNode
 
 
 class DriverTopics(NamedTuple):
-    """Where y_m and y come from, where v goes to, and where the driver reports it."""
+    """Where y_m and y come from, v goes to, and the driver reports it; types: of their messages."""
 
     reference: str
-    reference_type: type[Any]
     output: str
-    output_type: type[Any]
     control: str
-    control_type: type[Any]
     applied: str
-    applied_type: type[Any]
+    types: dict[str, type[Any]]
 
 
 def driver_topics(p: Parameters) -> DriverTopics:
     """The topics and types that io.style, io.command and joints ask for."""
-    style, of_joints = p.io.style, bool(p.joints) or p.io.style == 'joint_state_topic'
-    applied = (topics.APPLIED_JOINT_COMMANDS, JointState) if of_joints \
-        else (topics.APPLIED_CONTROL, Float64)
-    reference = topics.REFERENCE, JointState if of_joints else Float64
-    control = topics.JOINT_COMMANDS, Float64MultiArray
-    if style == 'native':
-        return DriverTopics(
-            *reference, topics.PLANT_OUTPUT, Float64, topics.CONTROL, Float64, *applied
-        )
-    if style == 'ros2_control':
-        return DriverTopics(*reference, topics.JOINT_STATES, JointState, *control, *applied)
-    if p.io.command == 'joint_state':
-        control = topics.JOINT_STATE_COMMANDS, JointState
-    return DriverTopics(
-        topics.ROBOT_COMMAND, JointState, topics.ROBOT_STATES, JointState, *control, *applied
-    )
+    of_joints = bool(p.joints) or p.io.style == 'joint_state_topic'
+    commands = topics.JOINT_COMMANDS if p.io.command == 'array' else topics.JOINT_STATE_COMMANDS
+    names = (*{
+        'native': (topics.REFERENCE, topics.PLANT_OUTPUT, topics.CONTROL),
+        'ros2_control': (topics.REFERENCE, topics.JOINT_STATES, topics.JOINT_COMMANDS),
+        'joint_state_topic': (topics.ROBOT_COMMAND, topics.ROBOT_STATES, commands),
+    }[p.io.style], topics.APPLIED_JOINT_COMMANDS if of_joints else topics.APPLIED_CONTROL)
+    types: dict[str, type[Any]] = dict.fromkeys(names, JointState) | {
+        topics.PLANT_OUTPUT: Float64, topics.CONTROL: Float64, topics.APPLIED_CONTROL: Float64,
+        topics.JOINT_COMMANDS: Float64MultiArray,
+        topics.REFERENCE: JointState if of_joints else Float64,
+    }
+    return DriverTopics(*names, types)
 
 
 def check_style(p: Parameters) -> None:
@@ -137,9 +131,12 @@ class DriverIo:
         def hear_outputs(message: float | JointMessage, info: dict[str, Any]) -> None:
             values, stamp_ns, number = \
                 self.values(message), 0, info['publication_sequence_number']
-            numbered = not isinstance(message, JointMessage)
+            of_joints = isinstance(message, JointMessage)
             if isinstance(message, JointMessage):
-                self._count_skipped(message, values)
+                if len(values) < len(self.skipped):
+                    self.seen = ', '.join(message.name)
+                for joint, skipped in self.skipped.items():
+                    self.skipped[joint] = 0 if joint in values else skipped + 1
                 if not values:
                     return
                 before, self._stamp = self._stamp, (message.stamp_ns, number)
@@ -150,21 +147,10 @@ class DriverIo:
                 stamp_ns = 0 if self._repeats_stamps else message.stamp_ns
             # Drivers that leave the header empty are known by the stamp of the middleware.
             known = (stamp_ns or self.stamp_ns(info), info['source_timestamp'],
-                     info['received_timestamp'], number, numbered)
+                     info['received_timestamp'], number, not of_joints)
             hear({joint: Output(y, *known) for joint, y in values.items()})
 
-        to = self.topics
-        return self._listen(
-            to.output_type, to.output, hear_outputs, output_qos(self._p, depth), polled
-        )
-
-    def _count_skipped(self, message: JointMessage, values: Mapping[str, float]) -> None:
-        if len(values) < len(self.skipped):
-            self.seen = ', '.join(message.name)
-            for joint in self.skipped:
-                self.skipped[joint] = 0 if joint in values else self.skipped[joint] + 1
-        elif any(self.skipped.values()):
-            self.skipped = dict.fromkeys(self.skipped, 0)
+        return self._listen(self.topics.output, hear_outputs, output_qos(self._p, depth), polled)
 
     def listen_to_references(
         self, hear: Callable[[Mapping[str, float]], None], qos: QoSProfile | int, polled: bool,
@@ -175,37 +161,34 @@ class DriverIo:
                 self._referred = message
             hear(self.values(message))
 
-        to = self.topics
-        self._heard['references'] = self._listen(
-            to.reference_type, to.reference, hear_references, qos, polled
-        )
+        topic = self.topics.reference
+        self._heard['references'] = self._listen(topic, hear_references, qos, polled)
 
     def listen_to_reports(self, hear: Callable[[Mapping[str, float], int], None]) -> None:
         """Have serve_waiting call hear with each v the driver has applied, and its stamp [ns]."""
         self._heard['reports'] = self._listen(
-            self.topics.applied_type, self.topics.applied,
+            self.topics.applied,
             lambda message, info: hear(self.values(message), self.stamp_ns(info)), KEPT_COMMANDS,
         )
 
     def listen_to_commands(self, hear: Callable[[Mapping[str, float]], None]) -> Subscription:
         """Call hear with every v that anybody sends to the driver."""
         return self._listen(
-            self.topics.control_type, self.topics.control,
-            lambda message, info: hear(self.values(message)), 1, polled=False,
+            self.topics.control, lambda message, info: hear(self.values(message)), 1, polled=False
         )
 
     def _listen(
-        self, message_type: type[Any], topic: str, hear: Callable[[Any, dict[str, Any]], None],
-        qos: QoSProfile | int, polled: bool = True,
+        self, topic: str, hear: Callable[[Any, dict[str, Any]], None], qos: QoSProfile | int,
+        polled: bool = True,
     ) -> Subscription:
+        kind = self.topics.types[topic]
         readers: dict[type[Any], Callable[[bytes], Any]] = {
             Float64: number_of, JointState: JointReader().read,
             Float64MultiArray: lambda content: deserialize_message(content, Float64MultiArray).data,
         }
-        read = readers[message_type]
+        read = readers[kind]
         return self._node.listen(
-            message_type, topic, lambda content, info: hear(read(content), info), qos, raw=True,
-            polled=polled,
+            kind, topic, lambda content, info: hear(read(content), info), qos, True, polled
         )
 
     @property
@@ -238,14 +221,13 @@ class DriverIo:
 
     def advertise(self) -> Publisher:
         """Make the publisher of v."""
-        self.publisher = self._node.create_publisher(
-            self.topics.control_type, self.topics.control, DEPTH
-        )
+        topic = self.topics.control
+        self.publisher = self._node.create_publisher(self.topics.types[topic], topic, DEPTH)
         return self.publisher
 
     def publish(self, commands: Mapping[str, float]) -> None:
         """Send v, by joint, to the driver; an array as soon as there is a v of every joint."""
-        kind = self.topics.control_type
+        kind = self.topics.types[self.topics.control]
         if kind is Float64MultiArray:
             self._newest.update(commands)
             if len(self._newest) == len(self.skipped):

@@ -13,7 +13,7 @@ from array import array
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from struct import Struct, pack, unpack_from
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.event_handler import PublisherEventCallbacks
@@ -97,6 +97,11 @@ class DiagnosticsPublisher:
             log.warning(self._prefix + text)
         else:
             log.error(self._prefix + text)
+
+
+def name_of_type(message_type: type[Any]) -> str:
+    """As discovery and bags have it, std_msgs/msg/Float64."""
+    return f'{message_type.__module__.split(".")[0]}/msg/{message_type.__name__}'
 
 
 def arrival_ns(received_ns: int) -> int:

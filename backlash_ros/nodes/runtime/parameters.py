@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -27,16 +27,24 @@ from backlash_ros.core.parameters import (
 
 
 class ParameterNode(Node):
-    """A node with a complete, checked set of parameters."""
+    """A node with a complete, checked set of parameters, of which all or none change."""
 
     settings: Parameters
 
+    def is_configured(self) -> bool:
+        """Whether only live parameters may change now, of those that are not read-only."""
+        return False
+
+    def check_change(self, p: Parameters) -> None:
+        """Raise ParameterError for values that the node cannot take up."""
+
+    def take_up(self, before: Parameters) -> None:
+        """Use the settings, which have changed."""
+
     def declare_settings(self, executable: str, reconfigurable: bool) -> None:
-        """Declare and check what the table says this executable uses.
+        """Declare what the table says this executable uses; raises ParameterError.
 
         reconfigurable: whether all but the fixed ones may change while the node is unconfigured.
-        Raises ParameterError for what rclpy would ignore (a given name that nobody declares) or
-        refuse.
         """
         # rclpy has no other way to ask for all names that were given; two are declared by itself.
         given = {
@@ -78,7 +86,7 @@ class ParameterNode(Node):
         Command-line tools send 1e-6 as a text and [1, 2] as integers, and load whole files in which
         most values are the present ones, also of parameters that cannot change.
         """
-        changes = []
+        changes, values = [], {}
         try:
             for change in parameter_list:
                 name, entry = change.name, entry_of(change.name)
@@ -87,48 +95,24 @@ class ParameterNode(Node):
                     changes += [change] * (present is None or change.value != present)
                 elif (value := check_value(entry, _given_value(change))) \
                         != check_value(entry, present):
+                    if entry.change == 'unconfigured' and self.is_configured():
+                        raise ParameterError(
+                            name, UNTOLD, 'is read-only while the node is configured',
+                            'deactivate it and clean it up first',
+                        )
                     changes.append(_ros_parameter(name, value, entry))
+                    values[name] = value
+            if not changes:
+                return SetParametersResult(successful=True)
+            settings = self.settings.replaced(values)
+            self.check_change(settings)
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
-        if not changes:
-            return SetParametersResult(successful=True)
-        return super().set_parameters_atomically(changes)
-
-    def let_parameters_change(
-        self, check: Callable[[Parameters], object], apply: Callable[[Parameters], None],
-        is_free: Callable[[], bool] = lambda: False,
-    ) -> None:
-        """Let parameters change in a running node, all or nothing.
-
-        check: raises ParameterError for a set that the node cannot take up. apply: takes up the new
-        settings, given the ones before. is_free: whether the node is unconfigured, so that those
-        may change as well that are not live.
-        """
-        def changed(changes: list[RosParameter]) -> Parameters:
-            return self.settings.replaced(
-                {change.name: change.value for change in changes if entry_of(change.name)}
-            )
-
-        def on_set(changes: list[RosParameter]) -> SetParametersResult:
-            for change in changes:
-                entry = entry_of(change.name)
-                if entry is not None and not (entry.change == 'live' or is_free()):
-                    return SetParametersResult(successful=False, reason=(
-                        f'{change.name} is read-only while the node is configured: deactivate it '
-                        'and clean it up first'
-                    ))
-            try:
-                check(changed(changes))
-            except ParameterError as error:
-                return SetParametersResult(successful=False, reason=str(error))
-            return SetParametersResult(successful=True)
-
-        def post_set(changes: list[RosParameter]) -> None:
-            before, self.settings = self.settings, changed(changes)
-            apply(before)
-
-        self.add_on_set_parameters_callback(on_set)
-        self.add_post_set_parameters_callback(post_set)
+        result = super().set_parameters_atomically(changes)
+        if result.successful:
+            before, self.settings = self.settings, settings
+            self.take_up(before)
+        return result
 
 
 def _given_value(parameter: RosParameter) -> object:

@@ -39,12 +39,10 @@ ENABLED = os.environ.get('BACKLASH_ROS_EVENTS') == '1'
 
 
 def emit(event: str, **content: object) -> None:
-    """Tell the program that started the node of an event: a JSON object in a line of stdout.
-
-    Nothing unless BACKLASH_ROS_EVENTS=1. JSON has no nan: null.
-    """
+    """Tell the program that started the node, with BACKLASH_ROS_EVENTS=1, a JSON object a line."""
     if ENABLED:
         print(json.dumps({'event': event} | {
+            # JSON has no nan.
             name: None if isinstance(value, float) and not isfinite(value) else value
             for name, value in content.items()
         }), flush=True)
@@ -67,14 +65,13 @@ class InitialisationError(RuntimeError):
 class ProcessNode(ParameterNode):
     """A node that is the purpose of its process: parameters checked, then work until stopped.
 
-    begun_at: from here on the node finds others and is found, on the steady clock [s]. signals:
-    the SIGINT and SIGTERM that have come, noted in the middle of whatever the node does.
+    parameters_of: the executable whose parameters it reads. begun_at: from here on the node finds
+    others and is found, on the steady clock [s]. signals: the SIGINT and SIGTERM that have come.
     """
 
     def __init__(
         self, executable: str, parameters_of: str = '', reconfigurable: bool = False,
     ) -> None:
-        """parameters_of: the executable whose parameters it reads. Raises ParameterError."""
         super().__init__(executable)
         self.begun_at = time.monotonic()
         self.log = Node.get_logger(self)
@@ -84,7 +81,6 @@ class ProcessNode(ParameterNode):
 
     @property
     def stopping(self) -> bool:
-        """Whether a signal asks the node to end; the executor looks up ten times a second."""
         return bool(self.signals)
 
     def every(self, period_s: float, action: Callable[[], Any]) -> Timer:
@@ -96,7 +92,7 @@ class ProcessNode(ParameterNode):
         callback: Callable[[Any, dict[str, Any]], None], qos: QoSProfile | int, raw: bool = False,
         polled: bool = False,
     ) -> Subscription:
-        """Subscribe with a callback that also gets time stamp and number of the message.
+        """Subscribe with a callback that also gets the times and the number of the message.
 
         polled: it is called by serve_polled alone.
         """
@@ -141,7 +137,6 @@ def run(
 
     That of the node, or 2 for bad input, told in one line on stderr. Any other exception passes.
     """
-    goodbye_s = 0.4  # for the middleware to leave the network; a signal ends a node in a second
     arguments = sys.argv[1:] if args is None else args
     signals: list[int] = []
     # The handlers of rclpy would raise KeyboardInterrupt anywhere and shut ROS down beneath a node
@@ -159,12 +154,6 @@ def run(
         for complaint in complaints(arguments, executable, node.get_fully_qualified_name()):
             node.log.warning(complaint)
         node.signals = signals
-        distribution = os.environ.get('ROS_DISTRO', 'jazzy')
-        if distribution != 'jazzy':
-            node.log.warning(
-                f'ROS_DISTRO={distribution}: nodes serve messages by parts of rclpy that only that '
-                'of Jazzy is known to have: source ROS 2 Jazzy'
-            )
         executor = PromptExecutor(node)
         code = FAILED  # unless the work comes to its end
         try:
@@ -177,7 +166,8 @@ def run(
         finally:
             node.finish()
             code = node.exit_code or code
-            with exit_at_the_latest(goodbye_s, code):
+            # For the middleware to leave the network; a signal ends a node in a second.
+            with exit_at_the_latest(0.4, code):
                 executor.shutdown()
                 Node.destroy_node(node)
                 rclpy.try_shutdown()
@@ -206,20 +196,17 @@ def exit_at_the_latest(within_s: float, code: int) -> Iterator[None]:
     # struct sigevent: the argument of the function, signal, kind, function, attributes.
     thread = 2  # SIGEV_THREAD of <signal.h>: the timer calls a function, in a thread of its own
     event = struct.pack('@PiiPP32x', code, 0, thread, exit_now, 0)
-    armed = c.timer_create(time.CLOCK_MONOTONIC, event, ctypes.byref(timer)) == 0
-    if armed:
-        # struct itimerspec: period and delay as seconds and nanoseconds.
-        delay = struct.pack('@4l', 0, 0, int(within_s), int(within_s % 1.0 * 1e9))
-        c.timer_settime(timer, 0, delay, None)
+    # struct itimerspec: period and delay as seconds and nanoseconds.
+    delay = struct.pack('@4l', 0, 0, int(within_s), int(within_s % 1.0 * 1e9))
+    c.timer_create(time.CLOCK_MONOTONIC, event, ctypes.byref(timer))
+    c.timer_settime(timer, 0, delay, None)
     try:
         yield
     finally:
-        if armed:
-            c.timer_delete(timer)
+        c.timer_delete(timer)
 
 
 def _initialise(arguments: list[str]) -> None:
-    """Raises InitialisationError."""
     prefer_loopback(os.environ)
     # rcl would add a line without content to the one that says what is wrong.
     set_logger_level('rcl', LoggingSeverity.FATAL)
@@ -240,17 +227,17 @@ def _refuse_plain_arguments(
     executable: str, make_node: Callable[[], ProcessNode], arguments: Sequence[str],
 ) -> None:
     """Refuse what is no argument of ROS; print help where asked for."""
-    about = ''.join(
-        f'\n{"* " if p.change == "live" else "  "}{p.name}: {as_yaml(p.default)}'
-        f'\n      {p.description}'
-        + (f' [{p.unit}]' if p.unit else '')
+    about = [
+        f'{"* " if p.change == "live" else "  "}{p.name}: {as_yaml(p.default)}\n      '
+        + p.description + (f' [{p.unit}]' if p.unit else '')
         + (f' (one of {", ".join(p.choices)})' if p.choices else '')
         for p in BY_NAME.values() if executable in p.used_by
-    )
+    ]
     OptionParser(
         executable, ': parameters are given as --ros-args -p NAME:=VALUE or --params-file FILE',
         usage=f'{executable} [--ros-args -p NAME:=VALUE --params-file FILE ...]',
         description=sys.modules[make_node.__module__].__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        epilog=f'parameters, with their defaults (* may change in a running node):{about}',
+        formatter_class=argparse.RawDescriptionHelpFormatter, epilog='\n'.join(
+            ['parameters, with their defaults (* may change in a running node):', *about]
+        ),
     ).parse_args(remove_ros_args(arguments))
