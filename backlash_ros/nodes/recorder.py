@@ -22,9 +22,7 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray
 
 from backlash_ros import topics
-from backlash_ros.bags.reader import REPAIR_COMMAND
-from backlash_ros.bags.repair import repair_command
-from backlash_ros.bags.writer import Bag, RecordingError
+from backlash_ros.bags import REPAIR_COMMAND, Bag, RecordingError, repair_command
 from backlash_ros.core.loop.diagnosis import Finding, Level
 from backlash_ros.core.loop.sample_counter import UNNUMBERED
 from backlash_ros.core.parameters import RECORDER

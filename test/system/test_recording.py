@@ -18,8 +18,7 @@ from rosbags.highlevel import AnyReader
 from std_msgs.msg import Float64, Float64MultiArray
 
 from backlash_ros import topics
-from backlash_ros.bags.reader import BagError, BagReader, message_files
-from backlash_ros.bags.repair import damage
+from backlash_ros.bags import BagError, BagReader, damage, message_files
 from backlash_ros.tools import report
 from backlash_ros.tools.runs.read_run import read_bag
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 
 from backlash_ros import topics
-from backlash_ros.bags.reader import REPAIR_COMMAND, BagError, BagReader, Topic, is_bag
+from backlash_ros.bags import REPAIR_COMMAND, BagError, BagReader, Topic, is_bag
 from backlash_ros.core.loop.learned_model import LearnedModel, from_fields
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.closed_loop import ClosedLoop

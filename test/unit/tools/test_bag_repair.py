@@ -13,9 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.highlevel import AnyReader
 
-from backlash_ros.bags.reader import BagError, BagReader
-from backlash_ros.bags.repair import damage, repair, repair_command
-from backlash_ros.bags.writer import Bag
+from backlash_ros.bags import Bag, BagError, BagReader, damage, repair, repair_command
 
 FLOAT = 'std_msgs/msg/Float64'
 CDR = b'\x00\x01\x00\x00'

@@ -1,0 +1,364 @@
+"""rosbag2 bags: written so that a crash costs a moment at most; read, whole or torn; repaired.
+
+Torn ones are read by the stream reader of mcap and the recovery of SQLite: neither needs the index
+or the metadata.yaml that only a bag that was closed has.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import sqlite3
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager, suppress
+from itertools import count
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+import mcap.records
+from mcap.stream_reader import StreamReader, breakup_chunk
+from rosbags.interfaces import Connection
+from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
+from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+
+from backlash_ros.core.parameters import ParameterError
+from backlash_ros.options import BAD_INPUT, DONE, FAILED
+
+BAG_METADATA = 'metadata.yaml'  # written last, when a bag is closed
+STORAGE_OF_SUFFIX = {'.mcap': 'mcap', '.db3': 'sqlite3'}
+REPAIR_COMMAND = 'ros2 run backlash_ros recorder --repair'
+
+
+class RecordingError(RuntimeError):
+    """The bag cannot take any more: the message is the reason in a few words."""
+
+
+class BagError(ValueError):
+    """A bag cannot be read or repaired: one line says which, why and, if known, the cure."""
+
+
+class NoBagError(BagError):
+    """There is no bag where one was looked for."""
+
+
+class Topic(NamedTuple):
+    """A recorded topic; definition: text of the .msg file with all it refers to, if recorded."""
+
+    name: str
+    message_type: str
+    definition: str
+
+
+class BagMessage(NamedTuple):
+    """A recorded message in CDR."""
+
+    topic: Topic
+    stamp_ns: int
+    data: bytes
+
+
+class Bag:
+    """An open bag. After a RecordingError it is closed, and holds what was flushed before.
+
+    path: folder, must not exist. storage: mcap or sqlite3. Raises ParameterError.
+    saved: messages that a crash leaves. saved_ns: the time from the first to the last of them.
+    survives_a_crash: whether flush() works with the version of rosbags that is installed.
+    """
+
+    def __init__(self, path: str, storage: str) -> None:
+        self.path = Path(path)
+        self.saved = self.saved_ns = 0
+        self.survives_a_crash = True
+        self._types = get_typestore(Stores.ROS2_JAZZY)
+        self._lock = ExitStack()
+        if self.path.exists():
+            raise ParameterError('bag', path, 'exists already', 'name a new folder')
+        self._writer = Writer(self.path, version=9, storage_plugin=StoragePlugin[storage.upper()])
+        try:
+            with self._closed_on_error():
+                self._writer.open()
+                self._lock.enter_context(_locked_folder(self.path))
+                try:
+                    self._flush()
+                except AttributeError:
+                    self.survives_a_crash = False
+                _sync(self.path, self.path.parent)
+        except RecordingError as error:
+            # Half a bag would be in the way of the next attempt.
+            shutil.rmtree(self.path, ignore_errors=True)
+            raise ParameterError('bag', path, f'cannot be made: {error}',
+                                 'name a folder where there is room and you may write') from None
+
+    def add_topic(self, topic: str, message_type: str) -> Connection:
+        """Announce a topic, with a type like std_msgs/msg/Float64; raises RecordingError."""
+        with self._closed_on_error():
+            return self._writer.add_connection(topic, message_type, typestore=self._types)
+
+    def write(self, connection: Connection, stamp_ns: int, message: bytes) -> None:
+        """Write a serialised message; raises RecordingError."""
+        with self._closed_on_error():
+            self._writer.write(connection, stamp_ns, message)
+
+    def flush(self) -> None:
+        """Let all that was written survive a crash and a power cut; raises RecordingError."""
+        if self.survives_a_crash:
+            with self._closed_on_error():
+                self._flush()
+            self._note_saved()
+
+    def close(self) -> None:
+        """Write what readers need to open the bag; raises RecordingError."""
+        with self._closed_on_error():
+            self._writer.close()
+            _sync(*self.path.iterdir(), self.path)
+        self._note_saved()
+        self._lock.close()
+
+    def _flush(self) -> None:
+        """The only place that looks inside of rosbags, which has no such function of its own."""
+        storage: Any = self._writer.storage
+        if self._writer.storage_plugin is StoragePlugin.SQLITE3:
+            storage.conn.commit()
+            return
+        # A chunk without messages would have no time.
+        if storage.chunk.msgs:
+            storage.close_chunk()
+        storage.bio.flush()
+        os.fsync(storage.bio.fileno())
+
+    def _note_saved(self) -> None:
+        writer = self._writer
+        self.saved = sum(writer.counts.values())
+        self.saved_ns = max(0, writer.max_timestamp - writer.min_timestamp)
+
+    @contextmanager
+    def _closed_on_error(self) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, sqlite3.Error) as error:
+            # What does not fit on the disk now did not a moment ago.
+            with suppress(OSError, sqlite3.Error):
+                self._writer.abort()
+            self._lock.close()
+            text = error.strerror if isinstance(error, OSError) else ''
+            reason = text or ' '.join(str(error).split()) or type(error).__name__
+            raise RecordingError(reason) from error
+
+
+@contextmanager
+def _locked_folder(path: Path) -> Iterator[None]:
+    """Mark a bag as being written, at most until the process is gone.
+
+    Raises BlockingIOError if another process writes it. Some file systems cannot lock folders.
+    """
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise
+        except OSError:
+            pass
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _sync(*paths: Path) -> None:
+    """Let files and the entries of folders survive a power cut; raises OSError."""
+    for path in paths:
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        except OSError:
+            # Some file systems cannot do it for folders.
+            if not path.is_dir():
+                raise
+        finally:
+            os.close(descriptor)
+
+
+def is_bag(path: Path) -> bool:
+    """Whether path is the folder of a bag, properly closed or not, or a file of one."""
+    return (path / BAG_METADATA).is_file() or bool(message_files(path))
+
+
+def message_files(path: Path) -> list[Path]:
+    """The files with the messages of a bag in their order; itself, if it is one."""
+    files = [path] if path.is_file() else path.glob('*')
+    # bag_10 comes after bag_9.
+    return sorted((file for file in files if file.suffix in STORAGE_OF_SUFFIX),
+                  key=lambda file: (len(file.name), file.name))
+
+
+class BagReader:
+    """The messages of a bag: its folder, or a lone .mcap or .db3 file. Raises NoBagError.
+
+    topics: those of the bag, complete once messages() has ended. damage: what is wrong with the
+    bag, in words, '' for nothing, likewise.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.files = path, message_files(path)
+        self.topics: set[Topic] = set()
+        self.damage = ''
+        if not self.files:
+            rule = 'does not exist' if not path.exists() else \
+                'holds no .mcap and no .db3 file' if path.is_dir() else \
+                'is neither the folder of a bag nor an .mcap or .db3 file'
+            raise NoBagError(f'{path}: {rule}')
+
+    def messages(
+        self, wanted: Callable[[Topic], bool] = lambda topic: True,
+    ) -> Iterator[BagMessage]:
+        """Every sound message of the wanted topics, in the order in which they were written."""
+        self.damage = ''
+
+        def met(topic: Topic) -> bool:
+            self.topics.add(topic)
+            return wanted(topic)
+
+        for file in self.files:
+            read = _read_mcap if STORAGE_OF_SUFFIX[file.suffix] == 'mcap' else _read_sqlite
+            try:
+                yield from read(file, met)
+            # Whatever damaged bytes make a library stumble over, the file is damaged.
+            except Exception:
+                closed = (self.path / BAG_METADATA).is_file() or self.path.is_file()
+                self.damage = 'is damaged' if closed else 'was never closed'
+
+
+def _read_mcap(file: Path, wanted: Callable[[Topic], bool]) -> Iterator[BagMessage]:
+    """Messages up to the first record that is not sound; a chunk that is not is left out."""
+    topics: dict[int, Topic] = {}  # the wanted ones by the number of their channel
+    schemas: dict[int, mcap.records.Schema] = {}
+    broken = 0
+    with file.open('rb') as stream:
+        # A length that is garbage may be more than any memory holds.
+        size = os.fstat(stream.fileno()).st_size
+        for found in StreamReader(stream, emit_chunks=True, record_size_limit=size).records:
+            records: list[mcap.records.McapRecord] = [found]
+            if isinstance(found, mcap.records.Chunk):
+                try:
+                    records = breakup_chunk(found, validate_crc=True)
+                except Exception:
+                    broken += 1
+                    continue
+            for record in records:
+                if isinstance(record, mcap.records.Schema):
+                    schemas[record.id] = record
+                elif isinstance(record, mcap.records.Channel):
+                    schema = schemas[record.schema_id]
+                    topic = Topic(record.topic, schema.name, schema.data.decode())
+                    if wanted(topic):
+                        topics[record.id] = topic
+                elif isinstance(record, mcap.records.Message) and record.channel_id in topics:
+                    yield BagMessage(topics[record.channel_id], record.log_time, record.data)
+    if broken:
+        raise BagError(f'{file}: {broken} chunks are damaged')
+
+
+def _read_sqlite(file: Path, wanted: Callable[[Topic], bool]) -> Iterator[BagMessage]:
+    """Messages of all transactions that were committed, up to the first page that is not sound."""
+    # Opened for writing as well, SQLite takes back what a crash has left half done.
+    uri = f'{file.resolve().as_uri()}?mode=rw'
+    with closing(sqlite3.connect(uri, uri=True)) as database:
+        # Otherwise a file that has lost its end is refused as a whole.
+        database.execute('PRAGMA writable_schema = ON')
+        topics = {number: Topic(*rest) for number, *rest in database.execute(
+            'SELECT topics.id, name, type, encoded_message_definition FROM topics '
+            'LEFT JOIN message_definitions ON type = topic_type ORDER BY topics.id')}
+        chosen = [number for number, topic in topics.items() if wanted(topic)]
+        # By number, not by time: the index of the times may be the part that is damaged.
+        for number, stamp_ns, data in database.execute(
+                'SELECT topic_id, timestamp, data FROM messages NOT INDEXED '
+                f'WHERE topic_id IN ({", ".join(map(str, chosen))}) ORDER BY id'):
+            yield BagMessage(topics[number], int(stamp_ns), bytes(data))
+        if not database.execute('SELECT count(*) FROM metadata').fetchone()[0]:
+            raise BagError(f'{file}: was never closed')
+
+
+def repair_command(path: Path) -> int:
+    """Repair a bag and print the outcome; returns the exit code."""
+    try:
+        print('\n'.join(repair(path) or [f'{path} is complete: nothing to repair']))
+    except BagError as error:
+        print(f'recorder: {error}', file=sys.stderr)
+        return BAD_INPUT if isinstance(error, NoBagError) else FAILED
+    except KeyboardInterrupt:
+        print(f'recorder: interrupted, nothing of {path} is lost', file=sys.stderr)
+        return FAILED
+    return DONE
+
+
+def damage(bag: Path) -> str:
+    """What keeps a bag from being complete, in words; empty for one that is."""
+    reader = BagReader(bag)
+    for _ in reader.messages():
+        pass
+    return reader.damage or ('' if (bag / BAG_METADATA).is_file() else f'has no {BAG_METADATA}')
+
+
+def repair(bag: Path) -> list[str]:
+    """Put a complete bag in the place of a damaged one, which is kept beside it.
+
+    Returns what was saved, in lines, nothing for a bag that is complete. Raises BagError,
+    NoBagError where there is none.
+    """
+    bag = bag.resolve()
+    if bag.is_file():
+        raise NoBagError(f'{bag}: is a file: give the folder of the bag')
+    reader = BagReader(bag)
+    try:
+        with _locked_folder(bag):
+            why = damage(bag)
+            return _rewrite(reader, why) if why else []
+    except BlockingIOError:
+        raise BagError(f'{bag}: is being recorded: stop its recorder first') from None
+    except (OSError, sqlite3.Error, WriterError) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise BagError(f'{bag}: cannot be repaired: {reason}: is there room for a second copy, and '
+                       'may you write there? The bag is as it was') from None
+
+
+def _rewrite(reader: BagReader, why: str) -> list[str]:
+    bag = reader.path
+    connections: dict[Topic, Connection] = {}
+    storage = StoragePlugin[STORAGE_OF_SUFFIX[reader.files[0].suffix].upper()]
+    with TemporaryDirectory(dir=bag.parent, prefix=f'{bag.name}.') as folder:
+        # The name of a bag is that of its file as well.
+        repaired = Path(folder) / bag.name
+        with Writer(repaired, version=9, storage_plugin=storage) as writer:
+            for topic, stamp_ns, data in reader.messages():
+                for new in reader.topics - connections.keys():
+                    connections[new] = _announce(writer, new)
+                writer.write(connections[topic], stamp_ns, data)
+        if not any(writer.counts.values()):
+            raise BagError(f'{bag}: {why}, and holds no message that could be saved')
+        _sync(*repaired.iterdir(), repaired)
+        names = (f'{bag.name}.damaged{f".{n}" if n else ""}' for n in count())
+        original = next(path for path in map(bag.with_name, names) if not path.exists())
+        bag.rename(original)
+        repaired.rename(bag)
+        _sync(bag.parent)
+    width = max(len(topic.name) for topic in connections)
+    return [
+        f'{bag} {why}; saved: {(writer.max_timestamp - writer.min_timestamp) * 1e-9:.3f} s',
+        *sorted(f'  {topic.name:<{width}}  {writer.counts[connection.id]:>8} messages'
+                for topic, connection in connections.items()),
+        f'the original is kept: {original}',
+    ]
+
+
+def _announce(writer: Writer, topic: Topic) -> Connection:
+    types = get_typestore(Stores.EMPTY)
+    try:
+        types.register(get_types_from_msg(topic.definition, topic.message_type))
+        digest = types.hash_rihs01(topic.message_type)
+    except (TypesysError, KeyError) as error:
+        raise BagError(f'the definition of {topic.message_type} is damaged: {error}') from None
+    return writer.add_connection(
+        topic.name, topic.message_type, msgdef=topic.definition, rihs01=digest)

@@ -1,1 +1,0 @@
-"""Bags on disk: written so that a crash leaves them readable, read, repaired."""
