@@ -23,12 +23,10 @@ __all__ = [
     'build_reference', 'fit_record',
 ]
 
-_HOMES = {
-    'Estimate': 'estimate', 'Parameters': 'parameters', 'Status': 'estimate',
-    'build_closed_loop': 'simulation.closed_loop', 'build_controller': 'assembly',
-    'build_plant': 'assembly', 'build_reference': 'assembly',
-    'fit_record': 'record_fit',
-}
+_HOMES = dict(zip(__all__, (
+    'estimate', 'parameters', 'estimate', 'simulation.closed_loop', 'assembly', 'assembly',
+    'assembly', 'record_fit',
+), strict=True))
 
 
 def __getattr__(name: str) -> Any:

@@ -42,11 +42,7 @@ from backlash_ros.core.scenario import (
     build_true_model,
 )
 
-__all__ = [
-    'LAWS', 'STRUCTURES', 'WORKER_MODULES', 'build_controller', 'build_four_blocks',
-    'build_limits', 'build_model', 'build_plant', 'build_reference', 'build_state_model',
-    'build_structure', 'build_true_model', 'first_guess', 'known_before', 'law_fits', 'warnings_of',
-]
+__all__ = ['build_model', 'build_plant', 'build_reference', 'build_true_model']  # and its own
 
 # What a process imports that makes fits and gains.
 WORKER_MODULES = (fitted.__module__, better_design.__module__)
@@ -60,7 +56,6 @@ ONLY_IN = {
 
 
 def law_fits(law: str, structure: str) -> bool:
-    """Whether a law belongs into a structure."""
     return law not in ONLY_IN or ONLY_IN[law][0] == structure
 
 
@@ -70,8 +65,7 @@ def build_controller(
     """The controller with the law and the structure that the parameters name.
 
     estimate: to begin with, None for those that were known before. executor: where fits and gains
-    are made, None for here. Raises ParameterError for parameters that contradict each other and for
-    a G(z) through which the backlash cannot be learned.
+    are made, None for here. Raises ParameterError for parameters that contradict each other.
     """
     check_model(build_model(p))
     _check_first_guess(p)
@@ -83,7 +77,7 @@ def build_controller(
         raise ParameterError('structure', p.structure, f'must be {only} for estimator.law: {law}',
                              f'{why}; moving_horizon, lms and fixed fit any structure')
     executor, actuator = executor or Executor(), build_actuator(p)
-    estimator = build_law(p, estimate or known_before(p), executor)
+    estimator = _build_law(p, estimate or known_before(p), executor)
     serial = None if actuator is None else SerialPlant(
         actuator, build_state_model(p), p.estimator.output_noise_std)
     return AdaptiveController(
@@ -91,15 +85,13 @@ def build_controller(
     )
 
 
-def build_law(p: Parameters, initial: Estimate, executor: Executor) -> Law:
-    """The law that estimator.law names; initial: estimates to begin with."""
+def _build_law(p: Parameters, initial: Estimate, executor: Executor) -> Law:
     options, model, noise_std = p.estimator, build_state_model(p), p.estimator.output_noise_std
-    bounds = Bounds(options.bounds.m, options.bounds.c_r, options.bounds.c_l)
+    bounds = Bounds(*options.bounds)
     if options.law == 'moving_horizon':
-        observer = None
-        if p.structure != 'proportional':
-            given = initial if initial.learned else replace(initial, c_r=0.0, c_l=0.0)
-            observer = FixedBacklash(given, model, noise_std, DOUBT)
+        given = initial if initial.learned else replace(initial, c_r=0.0, c_l=0.0)
+        observer = None if p.structure == 'proportional' \
+            else FixedBacklash(given, model, noise_std, DOUBT)
         return MovingHorizon(
             initial, bounds, model, noise_std, options.input_noise_std, options.drift_std,
             p.sample_period, p.plant.uncertainty, observer, executor,
@@ -122,7 +114,6 @@ def build_law(p: Parameters, initial: Estimate, executor: Executor) -> Law:
 
 
 def build_structure(p: Parameters) -> ControlStructure:
-    """The linear part alone."""
     if p.structure == 'proportional':
         return Proportional()
     if p.structure == 'pole_placement':
@@ -164,30 +155,22 @@ def _state_model(numerator: tuple[float, ...], denominator: tuple[float, ...]) -
 
 def first_guess(p: Parameters) -> Estimate:
     """The estimates that estimator.initial names."""
-    initial = p.estimator.initial
-    return Estimate(initial.m, initial.c_r, initial.c_l, p.proportional.f)
+    return Estimate(*p.estimator.initial, p.proportional.f)
 
 
 def known_before(p: Parameters) -> Estimate:
-    """The estimates to begin with: those in estimates.file if they are to be loaded and there.
-
-    Raises ParameterError for a file that does not belong to these parameters.
-    """
+    """The estimates to begin with: those in estimates.file if they are to be loaded and there."""
     return load_estimate(p) or first_guess(p)
 
 
 def takes_model_as_exact(p: Parameters) -> bool:
     """Whether a G other than that of the paper's example is taken as exact by a law that learns."""
-    of_paper = all(p[name] == BY_NAME[name].default
-                   for name in ('plant.numerator', 'plant.denominator'))
-    return p.estimator.law == 'moving_horizon' and not p.plant.uncertainty and not of_paper
+    return p.estimator.law == 'moving_horizon' and not p.plant.uncertainty and any(
+        p[name] != BY_NAME[name].default for name in ('plant.numerator', 'plant.denominator'))
 
 
 def warnings_of(p: Parameters, with_reference: bool = True) -> list[str]:
-    """What is allowed but will make the estimate hard, a sentence each.
-
-    with_reference: whether the parameters of the reference are those in use.
-    """
+    """What is allowed but makes the estimate hard; with_reference: that of p is in use."""
     return model_warnings(build_model(p), p.sample_period, p.frequency if with_reference else None)
 
 

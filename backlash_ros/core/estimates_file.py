@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 from math import inf, isfinite, isnan, nan
 from pathlib import Path
+from typing import Any
 
 from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core.estimate import Estimate, Status
@@ -26,7 +27,7 @@ def was_given(estimate: Estimate) -> bool:
 
 def save_estimate(path: Path, estimate: Estimate, p: Parameters) -> None:
     """Write the file, complete or not at all; raises OSError."""
-    values = {name: asdict(estimate)[name] for name in (*NEEDED, *DEVIATIONS)}
+    values = {name: getattr(estimate, name) for name in (*NEEDED, *DEVIATIONS)}
     content = {
         'version': 1, 'key': _key(p),
         # JSON has no nan.
@@ -38,8 +39,7 @@ def save_estimate(path: Path, estimate: Estimate, p: Parameters) -> None:
 def load_estimate(p: Parameters) -> Estimate | None:
     """What estimates.file holds, None where it is not to be loaded or not there yet.
 
-    Raises ParameterError for a file that is broken or belongs to another plant or law. The law
-    `fixed` takes what any other one has learned.
+    Raises ParameterError for one that is broken or of another plant or law, `fixed` excepted.
     """
     if not p.estimates.load:
         return None
@@ -58,12 +58,11 @@ def load_estimate(p: Parameters) -> Estimate | None:
         raise refused(f'cannot be read: {error}', 'delete it or name another one') from None
     try:
         version, key, values = content['version'], dict(content['key']), content['estimate']
-        m, c_r, c_l, f, std_m, std_c_r, std_c_l = (
-            nan if values[part] is None else float(values[part])
-            for part in (*NEEDED, *DEVIATIONS))
+        numbers: Any = [nan if values[part] is None else float(values[part])
+                        for part in (*NEEDED, *DEVIATIONS)]
     except (KeyError, TypeError, ValueError):
         raise refused('holds no saved estimates', 'delete it or name another one') from None
-    estimate = Estimate(m, c_r, c_l, f, std_m, std_c_r, std_c_l)
+    estimate = Estimate(*numbers)
     if version != 1:
         raise refused(f'has format {version!r}, not 1')
     if was_given(estimate):
@@ -74,9 +73,9 @@ def load_estimate(p: Parameters) -> Estimate | None:
                           'name another file or set estimates.load: false')
     for part in NEEDED:
         value = getattr(estimate, part)
+        low, high = getattr(p.estimator.bounds, part, (-inf, inf))
         if not isfinite(value):
             raise refused(f'has no finite {part}')
-        low, high = (-inf, inf) if part == 'f' else getattr(p.estimator.bounds, part)
         if not low <= value <= high:
             raise refused(f'has {part}={value!r} outside of estimator.bounds.{part}')
     if estimate.c_l > estimate.c_r:
@@ -87,8 +86,7 @@ def load_estimate(p: Parameters) -> Estimate | None:
 
 
 def _key(p: Parameters) -> dict[str, object]:
-    """What a saved estimate depends on; a file for anything else is refused."""
+    """What a saved estimate depends on, as JSON has it; a file for anything else is refused."""
     names = ('estimator.law', 'sample_period', 'plant.numerator', 'plant.denominator',
              'control.delay_samples')
-    # As JSON has them.
     return {name: list(value) if isinstance(value := p[name], tuple) else value for name in names}

@@ -30,11 +30,7 @@ LOST = 'lost'  # kind of the failure of a job whose worker died
 
 
 class ChannelSamples(NamedTuple):
-    """Consecutive samples, the newest last.
-
-    first: number of the first of them, counted from the first one ever appended. columns: their
-    values, shape (quantities, N), read-only.
-    """
+    """Consecutive samples, columns (quantities, N), read-only; first: number of the oldest."""
 
     first: int
     columns: NDArray[np.float64]
@@ -47,10 +43,7 @@ class Failure(NamedTuple):
 
 
 class SampleBuffer:
-    """Samples, of which the oldest may be dropped, one after the other in `values`.
-
-    first: number of the first one that is there.
-    """
+    """Samples, one after the other in `values`; first: number of the oldest that is there."""
 
     def __init__(self, quantities: int, first: int = 0) -> None:
         self.quantities, self.first, self.values = quantities, first, array('d')
@@ -82,8 +75,8 @@ class SampleBuffer:
 class Channel:
     """A record, for jobs that need one, and at most one job at a time.
 
-    busy: whether there is a job whose result nobody has polled yet. result: of it. since, end: it
-    sees the samples from the one to before the other number.
+    busy: whether there is a job whose result nobody has polled yet. since, end: it sees the samples
+    from the one to before the other number.
     """
 
     def __init__(self, executor: Executor, number: int, quantities: int, capacity: int) -> None:
@@ -93,15 +86,13 @@ class Channel:
         self._executor, self._capacity = executor, capacity
 
     def append(self, *values: float) -> None:
-        """Append a sample to the record."""
         self.record.values.extend(values)
 
     def submit(self, job: Job, *args: Any, since: int = 0) -> bool:
-        """Have job(samples, *args) computed, with the samples that there are now.
+        """Have job(samples, *args) computed, or job(*args) without a record; False while busy.
 
-        job: a function at the top level of a module, which changes none of its arguments. Without
-        a record it is job(*args). since: number of the first sample that is needed, by this job
-        and those after it. Returns False, and does nothing, while the channel is busy.
+        job: a function at the top level of a module, which changes none of its arguments. since:
+        number of the first sample that is needed, by this job and those after it.
         """
         if self.busy:
             return False
@@ -119,7 +110,6 @@ class Channel:
         return result
 
     def close(self) -> None:
-        """Drop record and job."""
         self._executor.forget(self)
 
 
@@ -137,11 +127,9 @@ class Executor:
         return Channel(self, 0, quantities, capacity)
 
     def begin(self, channel: Channel, job: Job, args: tuple[Any, ...]) -> None:
-        """Have a job computed, after those that were submitted before it."""
         channel.result = _computed(job, channel.record, channel.since, channel.end, args)
 
     def forget(self, channel: Channel) -> None:
-        """Drop record and job of a channel."""
         channel.record = SampleBuffer(channel.record.quantities)
 
     def close(self) -> None:
@@ -158,10 +146,9 @@ def _computed(job: Job, record: SampleBuffer, since: int, end: int, args: tuple[
 class WorkerExecutor(Executor):
     """Computes jobs in a worker process, which begins with the first channel.
 
-    A thread sends it job after job, each with the samples that it does not have yet. One that dies
-    is replaced, and only the job that was under way is lost. It ends when its pipe does, that is
-    with its parent, however that ends, and imports nothing of the program that started it but
-    what its jobs need. preload: modules that it imports at its start, not with its first job.
+    One that dies is replaced, and only the job that was under way is lost. It ends with its parent,
+    however that ends, and imports nothing of that program but what jobs need. preload: modules that
+    it imports at its start, not with its first job.
     """
 
     def __init__(self, preload: Sequence[str] = ()) -> None:
@@ -175,7 +162,6 @@ class WorkerExecutor(Executor):
 
     @property
     def pid(self) -> int | None:
-        """Process id of the worker; None while there is none."""
         return None if self._worker is None else self._worker.pid
 
     def open(self, quantities: int = 0, capacity: int = 0) -> Channel:
@@ -205,7 +191,7 @@ class WorkerExecutor(Executor):
             _end(self._worker)
 
     def _exchange(self, worker: subprocess.Popen[bytes]) -> None:
-        """Have jobs done one by one, until this is closed."""
+        """Have jobs done one by one, each sent with the samples that are new to the worker."""
         sent: dict[int, int] = {}  # channel: number of the sample up to which the worker has it
         deaths = 0  # in a row without an answer
         for channel, job in iter(self._submitted.get, None):
@@ -242,7 +228,6 @@ class WorkerExecutor(Executor):
 
 
 def _start(preload: tuple[str, ...]) -> subprocess.Popen[bytes]:
-    """Start a worker: a bare interpreter that imports this module and what it is told to."""
     code = f'import sys; sys.path[:] = {sys.path!r}; ' \
         f'from {__name__} import serve; serve({preload!r})'
     process = subprocess.Popen(

@@ -25,18 +25,13 @@ def build_actuator(p: Parameters) -> Actuator | None:
 
 
 def build_true_model(p: Parameters) -> TransferFunction:
-    """G(z) of the simulated plant, which truth.* may set apart from the one that is known.
-
-    Raises ParameterError where that G(z) cannot be altered as truth.* asks.
-    """
+    """G(z) of the simulated plant, which truth.* may set apart from the one that is known."""
     truth, plant = p.truth, p.plant
     base = TransferFunction(
         truth.numerator or plant.numerator, truth.denominator or plant.denominator,
-        'truth' if truth.numerator or truth.denominator else 'plant',
-    )
+        'truth' if truth.numerator or truth.denominator else 'plant')
     altered = altered_plant(
-        base, truth.scale_frequency, truth.scale_damping, truth.extra_lag / p.sample_period
-    )
+        base, truth.scale_frequency, truth.scale_damping, truth.extra_lag / p.sample_period)
     samples = truth.delay_samples if truth.delay_samples >= 0 else p.control.delay_samples
     return delayed(altered, samples)
 

@@ -26,10 +26,9 @@ KEPT_COMMANDS = 256
 
 
 def report_use(p: Parameters) -> str:
-    """What estimator.use_applied_control comes to.
+    """What estimator.use_applied_control comes to; in lockstep every v is applied at once.
 
-    With control.delay_samples a driver may report v before or after that delay: auto leaves it
-    alone then. In lockstep every v is applied at once.
+    A driver may report v before or after control.delay_samples: auto leaves reports alone then.
     """
     use: str = p.estimator.use_applied_control
     return 'false' if p.lockstep or (use == 'auto' and p.control.delay_samples > 0) else use
@@ -62,12 +61,10 @@ class ReportTrust:
 class ReportOrigin:
     """Finds where reports have their zero: a motor encoder may not have been zeroed.
 
-    The motor follows its command v with a first-order lag, r(k) - b = p (r(k-1) - b) + (1 - p)
-    v(k): a straight line of r(k) - v(k) over r(k-1) - v(k). A motor that rests, or is saturated,
-    has p = 1 and tells nothing. What is left of the line has to be small beside b: a driver that
-    limits v to one side has no other origin.
-
-    value: b, 0 until another one is certain. before: what was known at the first report.
+    A first-order lag r(k) - b = p (r(k-1) - b) + (1 - p) v(k) is a straight line of r(k) - v(k)
+    over r(k-1) - v(k); at rest or saturated p = 1. What is left of it has to be small beside b: a
+    driver that limits v to one side has no other origin. value: b, 0 until another one is certain.
+    before: what was known at the first report.
     """
 
     def __init__(self) -> None:
@@ -128,13 +125,9 @@ def without_origin(reports: Array, commands: Array) -> Array:
 class CommandHistory:
     """Published commands by time [ns], and applied ones where the driver reports them.
 
-    The driver applies over an interval the newest v it has when the interval ends with the next
-    sample. So a v that cannot have been there when that sample was taken came too late, and the one
-    before it was in use: v is as long under way as y is.
-
-    counts: where late commands and missing reports are counted. trust: whether reports go before
-    own commands. origin: of reports, which is subtracted. newest_ns: when the newest command left,
-    own or of another controller. output_ns: stamp of the newest output that was used.
+    The driver applies over an interval the newest v it has at its end. A v that cannot have been
+    there then came too late; v is as long under way as y is. newest_ns: when the newest command
+    left, own or of another controller. output_ns: stamp of the newest output that was used.
     """
 
     def __init__(
@@ -149,14 +142,12 @@ class CommandHistory:
         self._reported: deque[tuple[int, float]] = deque(maxlen=KEPT_COMMANDS)
 
     def note_transit(self, passed_ns: float) -> None:
-        """Note how long an output was under way: a thousandth of a period moves the median."""
         step = 1e-3 * self._period_ns
         median = self._transit_ns + (step if passed_ns > self._transit_ns else -step)
         # Clocks of two hosts may differ by more than any message takes.
         self._transit_ns = min(max(median, 0.0), 0.25 * self._period_ns)
 
     def publish(self, v: float, stamp_ns: int) -> None:
-        """Note a command and when it left."""
         self._published.append((stamp_ns, v))
         self.newest_ns = stamp_ns
 
@@ -165,11 +156,10 @@ class CommandHistory:
         self._reported.append((stamp_ns, v))
 
     def over(self, intervals: int, end_ns: int, due_ns: float) -> tuple[list[float], list[float]]:
-        """v over each of the newest `intervals`, oldest first; the last one ended at end_ns.
+        """v over each of the newest intervals, oldest first, the last of which ended at end_ns.
 
-        due_ns: when it should have ended, and so a whole number of periods after the others.
-        And for each the command that left next to it, where that was within a period of the time
-        that decides: nobody knows how long it was under way. nan where there is none.
+        due_ns: when it should have. And for each the command that left within a period of the time
+        that decides, and so may have acted instead; nan where there is none.
         """
         # A driver that was held up reads y first, and then the commands that came meanwhile; what
         # left later than messages are under way was not there.
@@ -180,11 +170,7 @@ class CommandHistory:
         return list(acted), list(others)
 
     def newest_report(self, end_ns: int) -> float:
-        """The v reported for the interval that ended at end_ns, nan without one.
-
-        It tells where the commands begin, even where it is not to be learned from. A command that
-        left in that interval outdates it.
-        """
+        """The v reported for the interval that ended at end_ns, nan if there is a newer command."""
         if self._reported and end_ns > self.newest_ns + self._period_ns \
                 and self._reported[-1][0] > end_ns - 1.5 * self._period_ns:
             return self._reported[-1][1] - self.origin.value
@@ -193,9 +179,8 @@ class CommandHistory:
     def reported_over(self, intervals: int, end_ns: int, unsent: int = 0) -> list[float]:
         """Reports since the last output, one per interval; empty where they are not to be used.
 
-        unsent: intervals at whose end the driver was held up: it has neither measured nor reported
-        then, and the v of its next report was in use all the time. Empty, and counted, where there
-        is not one per interval though they are used.
+        unsent: intervals at whose end the driver was held up, neither measured nor reported: the v
+        of its next report was in use all the time.
         """
         begin_ns, self.output_ns = self.output_ns, end_ns
         stamp_ns, reports = begin_ns, []
@@ -236,7 +221,6 @@ class HeldControl:
         self._before, self._arrived_ns = 0.0, 0
 
     def take(self, v: float, arrived_ns: int) -> None:
-        """A v has come, at this time."""
         self._before, self.newest, self._arrived_ns = self.newest, v, arrived_ns
 
     def over(self, ended_ns: float) -> float:
@@ -251,8 +235,7 @@ def v_of_intervals(
 
     index: number of each sample whose y was heard, rising from 0. output_ns: stamps of these y.
     command_ns, v (M,): messages of v in the order of time. reported: whether they are reports of
-    the v that acted, one just before each y; else commands, of which the newest acts that is there
-    when the interval ends with the next y.
+    the v that acted, one just before each y.
     """
     outputs, commands = ((each - output_ns[0]).astype(float) for each in (output_ns, command_ns))
     ends = np.interp(np.arange(1, index[-1] + 2), index, outputs)

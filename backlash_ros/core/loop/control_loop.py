@@ -44,7 +44,6 @@ class Event(Enum):
     RIVAL_GONE = (Phase.STANDS_DOWN,), Phase.BEGINS
 
     def after(self, phase: Phase) -> Phase:
-        """The phase that follows on this one."""
         phases, following = self.value
         return following if phase in phases else phase
 
@@ -52,8 +51,7 @@ class Event(Enum):
 class Driver(NamedTuple):
     """What a loop can ask about its driver: the clock of its stamps, who else tells of it.
 
-    may_report: whether it may yet say which v acts. applied: the name of these reports. warn: tells
-    the user. steady_s: a clock that nobody sets [s].
+    applied: the name of its reports of v. warn: tells the user. steady_s: a clock nobody sets [s].
     """
 
     now_ns: Callable[[], int]
@@ -65,10 +63,7 @@ class Driver(NamedTuple):
 
 @dataclass
 class Newest:
-    """What has come last: y_m; when it and y came, on the steady clock [s]; nan before.
-
-    unanswered: outputs, as long as nobody knew v.
-    """
+    """What has come last, and when, on the steady clock [s]; nan before. unanswered: outputs."""
 
     y_m: float = nan
     y_m_at: float = nan
@@ -79,9 +74,9 @@ class Newest:
 class ControlLoop:
     """Answers outputs with commands, whatever the driver does.
 
-    send: takes v to the driver. estimate: to begin with, None for what was known before. counter:
-    goes on counting where another loop has ended. v: the command that acts; None, and then taken
-    for 0, as long as nobody knows (knows_v). executor: where fits are made, None for here.
+    estimate: to begin with, None for what was known before. v: the command that acts; None, and
+    then taken for 0, as long as nobody knows (knows_v). executor: where fits are made, None for
+    here.
     """
 
     def __init__(
@@ -108,7 +103,6 @@ class ControlLoop:
 
     @property
     def counted(self) -> dict[str, int]:
-        """All counts by name."""
         return self.statistics.by_name() | {'dead_workers': self.executor.restarts}
 
     @property
@@ -127,7 +121,6 @@ class ControlLoop:
 
     @property
     def begins(self) -> bool:
-        """Whether the next command is the first one, since the start or an interruption."""
         return self.phase in (Phase.BEGINS, Phase.SILENT)
 
     @property
@@ -149,7 +142,6 @@ class ControlLoop:
             self.statistics.bad_references += 1
 
     def take_applied(self, v: float, stamp_ns: int) -> None:
-        """Take in a v that the driver reports to have applied."""
         if plausible(v):
             self.commands.report(v, stamp_ns)
         else:
@@ -296,12 +288,10 @@ class ControlLoop:
             self.end(self._p.on_timeout)
 
     def stand_down(self) -> None:
-        """Leave the actuator to another controller."""
         self._happens(Event.RIVAL)
         self._ending = iter(())
 
     def hear_other(self, v: float) -> None:
-        """Take in a command of the controller that is in charge."""
         if self.standing_down and plausible(v):
             self._go_on_from(v)
             self.commands.newest_ns = self._driver.now_ns()
@@ -313,15 +303,11 @@ class ControlLoop:
         self._renew_core(self.estimate)
 
     def end(self, action: str) -> None:
-        """Have send_next lead v to its end as on_stop or on_timeout say.
-
-        Not where nobody knows v: then this loop has not commanded anything either.
-        """
+        """Have send_next lead v to its end as on_stop or on_timeout say, if anybody knows v."""
         self._ending = last_commands(action, self.core.motion, lambda: self.core.limits) \
             if self.knows_v else iter(())
 
     def send_next(self) -> bool:
-        """Send the next of these commands; returns whether there was one."""
         v = next(self._ending, None)
         if v is not None:
             self.send(v)
@@ -334,15 +320,12 @@ class ControlLoop:
         self._renew_core(estimate)
 
     def reset(self) -> None:
-        """Begin with the estimates of estimator.initial."""
         self.renew(first_guess(self._p))
 
     def adapt(self, adapting: bool) -> None:
-        """Learn, or hold the estimates."""
         self.core.estimator.adapting = adapting
 
     def compensate(self, compensating: bool) -> None:
-        """Cancel the gap, or invert the slope alone."""
         self.core.compensating = compensating
 
     def take_up(self, p: Parameters) -> None:

@@ -71,7 +71,6 @@ class LevelLog:
         self._seen, self._seen_since = (Level.OK, ''), -inf
 
     def take(self, finding: Finding, now_s: float) -> None:
-        """Take in what is published in /diagnostics now."""
         key = (finding.level, finding.kind if finding.level != Level.OK else '')
         if key != self._seen:
             self._seen, self._seen_since = key, now_s
@@ -95,9 +94,9 @@ def short(name: str) -> str:
 
 
 class Peer(NamedTuple):
-    """Another publisher or subscriber of a topic; unfit: why no message passes, empty if it does.
+    """Another publisher or subscriber of a topic. kind: its message type without the package.
 
-    kind: its message type without the package. unfit is one of '', 'type', 'reliability', 'qos'.
+    unfit: why no message passes: 'type', 'reliability', 'qos', or empty if it does.
     """
 
     name: str
@@ -120,11 +119,9 @@ class TopicFigures(NamedTuple):
 
     @property
     def heard(self) -> list[Peer]:
-        """Those whose messages pass."""
         return [peer for peer in self.peers if not peer.unfit]
 
     def waiting(self, start: str) -> str:
-        """Why nothing comes; start: what to do where nobody publishes it."""
         why = f'{self.heard[0]} is there but sends none' if self.heard \
             else f'nobody publishes it, {start}'
         return f'waiting for {self}: {why}'
@@ -142,8 +139,7 @@ class Neighbours(NamedTuple):
 class Learning(NamedTuple):
     """How the learning goes. given: the estimates are taken as the parameters give them.
 
-    status: None before the first command. inconsistent_s: for how long of samples it has been
-    INCONSISTENT.
+    status: None before the first command. inconsistent_s: for how long it has been INCONSISTENT.
     """
 
     status: Status | None = None
@@ -243,7 +239,6 @@ def _findings(rows: Iterable[Row]) -> list[Finding]:
 
 
 def _is_unexplained(law: LawReport) -> bool:
-    """Whether so much motion is explained by nothing that it is worth naming."""
     return 0.05 <= law.unexplained < inf
 
 
@@ -252,7 +247,6 @@ def _percent(count: int, of: int) -> str:
 
 
 def _unheard(around: Neighbours) -> list[Row]:
-    """Who is there on a topic though no message passes."""
     sent = '{0} is sent as {1.kind}, {0.kind} is wanted: change {1}'
     best_effort = '{0} is sent best effort, which does not arrive: '
     texts = {

@@ -18,9 +18,9 @@ from backlash_ros.core.parameters import Parameters
 class JointLoops:
     """Answers a message about all joints with one of commands for all; no loop knows another.
 
-    send: takes v, by joint, to the driver. driver: what can be asked about that of a joint.
-    by_name: the loops, in the order of `joints`; a single one may be nameless. turns: for each
-    sample the loop that may take up and submit fits after it, None for none.
+    driver: what can be asked about that of a joint. by_name: the loops, in the order of `joints`; a
+    single one may be nameless. turns: for each sample the loop that may look after fits then, or
+    none.
     """
 
     def __init__(
@@ -45,10 +45,7 @@ class JointLoops:
     def answer(
         self, outputs: Mapping[str, Output], y_m: float | None = None,
     ) -> dict[str, ControlStep]:
-        """Send v(k) for y(k) of all joints that there are; returns the steps that were made.
-
-        y_m: as in ControlLoop.answer.
-        """
+        """Send v(k) for y(k) of all joints that there are; returns the steps that were made."""
         arrival = self.counter.count(*next(iter(outputs.values())).counted)
         if self._together and any(
             loop.silent and not (joint in outputs and isfinite(outputs[joint].y))
@@ -73,24 +70,20 @@ class JointLoops:
             self.by_name[joint].take_reference(value)
 
     def give_up_silent(self) -> bool:
-        """Give up drivers that are newly silent; returns whether there are any.
-
-        An arm of which one joint is lost stops as one, unless told otherwise.
-        """
+        """Give up drivers that are newly silent, or all joints; returns whether any is."""
         overdue = [loop for loop in self.loops if loop.is_overdue]
         for loop in self.loops if overdue and self._together else overdue:
             loop.give_up()
         return bool(overdue)
 
     def end(self, action: str) -> list[ControlLoop]:
-        """Have send_next lead v to its end, as ControlLoop.end; returns the loops that command."""
+        """As ControlLoop.end; returns the loops that command."""
         ending = [loop for loop in self.loops if loop.statistics.used and not loop.standing_down]
         for loop in ending:
             loop.end(action)
         return ending
 
     def send_next(self) -> bool:
-        """Send the next of these commands; returns whether there was any."""
         sent = [loop.send_next() for loop in self.loops]
         self._send_waiting()
         return any(sent)

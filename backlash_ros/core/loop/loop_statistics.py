@@ -42,10 +42,9 @@ class Counts:
 class LoopStatistics(Counts):
     """Counts since the loop began, and what tells how well it runs now.
 
-    still_band: by how much y may differ where it stands still. still: newest values of y in a row
-    that are equal; still_v: lowest and highest v meanwhile. v_range: those since they were asked
-    for. inconsistent: newest samples in a row that contradict the estimate. latencies [s]: the
-    newest ones, as topics.py defines them.
+    still: newest values of y in a row that are equal within still_band; still_v: lowest and highest
+    v meanwhile. v_range: those since they were asked for. inconsistent: newest samples in a row
+    that contradict the estimate. latencies [s]: the newest ones, as topics.py defines them.
     """
 
     still_band: float = 0.0

@@ -8,16 +8,13 @@ from backlash_ros.core.loop.sample_counter import JITTER
 
 
 class ReferencePace:
-    """Says at any time which sample of y_m is to leave now, if any.
+    """Says at any time which sample of y_m is to leave now, if any; times are on a steady clock
+    [s].
 
-    With y(k) heard, y_m(k+1) leaves half a period after y(k) was due, or as soon as a late y(k) is
-    there. An output that is later than jitter explains counts as lost, as in the counter of
-    samples, and y_m goes on by the own clock until one comes again. So at most one message leaves
-    per period, and none for the same sample twice once the first output has come.
-
-    waits: whether y_m(0) is repeated until the first output comes; else the own clock runs from the
-    start, and goes on from there. own_clock: False on simulated time, which may run at any speed:
-    without outputs the newest y_m is repeated. Times are on the steady clock [s].
+    y_m(k+1) leaves half a period after y(k) was due, or as soon as a late y(k) is there; without
+    outputs it goes on by the own clock. At most one leaves per period, and none for the same sample
+    twice once the first output has come. waits: y_m(0) is repeated until then. own_clock: False on
+    simulated time, which may run at any speed: the newest y_m is repeated.
     """
 
     def __init__(self, period_s: float, waits: bool, now_s: float, own_clock: bool = True) -> None:
@@ -30,7 +27,6 @@ class ReferencePace:
         self._due_s = now_s
 
     def hear(self, index: int, at_s: float) -> None:
-        """Take in that output number `index` has come at this time."""
         if self._heard_s == -inf:
             self._offset = 1 if self.waits else self._next - index
         # Where the own clock has run ahead, y_m does not go back.

@@ -41,12 +41,10 @@ class Period(NamedTuple):
 
 
 class Timing(NamedTuple):
-    """What is known of when y comes; what is not known is nan.
+    """What is known of when y comes; nan where it is not. nominal_s: the period of the model.
 
-    nominal_s: the period of the model. intervals_s: low, mean and high of the newest ones between
-    messages, of which a tenth is shorter and a tenth longer. age_s: median time from stamp to
-    arrival, negative where the clock of the driver is ahead. repeats_stamps: whether it sends some
-    of them twice.
+    intervals_s: low, mean and high of the newest ones between messages, of which a tenth is shorter
+    and a tenth longer. age_s: median time from stamp to arrival. repeats_stamps: the driver does.
     """
 
     nominal_s: float
@@ -66,9 +64,8 @@ class Timing(NamedTuple):
     def rate(self) -> float:
         """The rate of y [Hz] where it is not that of the model, else nan.
 
-        Losses and stalls lengthen some of the intervals, messages sent twice shorten some: where
-        the period is not known, the rate is wrong only if nearly all intervals are off to the same
-        side by a tenth.
+        Where the period is not known, only if nearly all intervals are off to the same side by a
+        tenth: losses and stalls lengthen some of them, messages sent twice shorten some.
         """
         # From 0.5 % on, less what is not known of the period after a second.
         if self.period.differs_from(self.nominal_s, 0.0045) or self.is_stretched:
@@ -79,10 +76,7 @@ class Timing(NamedTuple):
 
 
 class DriverPeriod:
-    """Learns the period of a driver from the stamps of its samples [ns].
-
-    period_ns: that to count with, nominal_s where no other one is certain.
-    """
+    """Learns the period of a driver [s] from stamps [ns]; period_ns: to count with."""
 
     def __init__(self, nominal_s: float) -> None:
         self.nominal_s, self.period_ns = nominal_s, 1e9 * nominal_s
@@ -98,7 +92,6 @@ class DriverPeriod:
             self._ages_s.append((received_ns - stamp_ns) * 1e-9)
 
     def follow(self, stamp_ns: int) -> None:
-        """Take in the stamp of the next sample."""
         self._samples_ns.append(stamp_ns)
         self._since_learned += 1
 
@@ -126,7 +119,6 @@ class DriverPeriod:
             self.period_ns = 1e9 * (found.mean if off else nominal_s)
 
     def timing(self) -> Timing:
-        """All that is known now."""
         intervals = sorted(later - earlier for earlier, later in pairwise(self._messages_ns))
         low = mean = high = nan
         if len(intervals) >= 20:
@@ -139,8 +131,8 @@ class DriverPeriod:
     def newest(self, intervals: int = 1000) -> Period:
         """The period over so many intervals at most: the slope of the stamps over their samples.
 
-        It is known to some 0.1 % after a second. A message that was lost, or came twice, does not
-        disturb it; unknown where most intervals are no period at all, or scatter widely.
+        Known to some 0.1 % after a second, whatever was lost or came twice; unknown where most
+        intervals are no period at all, or scatter widely.
         """
         stamps = list(islice(reversed(self._samples_ns), intervals + 1))[::-1]
         if len(stamps) <= 20:
@@ -184,8 +176,7 @@ def _numbered(times: list[float], period_s: float) -> list[float]:
 class Output(NamedTuple):
     """A measured y, when it was sampled, sent and received [ns], and the number of its message.
 
-    numbered: whether each number is a sample. Else the sender also publishes messages without y,
-    and the numbers only tell it from other senders.
+    numbered: whether each number is a sample; else they only tell one sender from another.
     """
 
     y: float
@@ -197,16 +188,14 @@ class Output(NamedTuple):
 
     @property
     def counted(self) -> tuple[int, int, bool, int]:
-        """What a counter asks for."""
         return self.stamp_ns, self.sequence, self.numbered, self.received_ns
 
 
 class Arrival(NamedTuple):
-    """What a message is.
+    """What a message is; is_sample: no repetition, flood, old message or second sender.
 
-    is_sample: False for repetitions, floods, old messages and second senders. missing: samples
-    that never came before this one. unsent: those of them that the sender has not numbered, and so
-    not published. restarted: sender or clock did: nobody knows what the plant did in between.
+    missing: samples that never came before it. unsent: those of them that the sender has not
+    numbered. restarted: sender or clock did: nobody knows what the plant did in between.
     """
 
     is_sample: bool = True
@@ -219,17 +208,12 @@ NO_SAMPLE, NEXT_SAMPLE = Arrival(is_sample=False), Arrival()
 
 
 class SampleCounter:
-    """Counts samples by two witnesses, of which the larger count is believed.
+    """Counts samples by two witnesses, number and stamp, of which the larger count is believed.
 
-    Sequence numbers tell what the middleware lost. Time stamps tell besides what was never
-    published, or lost by a relay that renumbers: sample k is due one period of the sender after
-    sample k-1. A sender that does not keep time, like one that answers each control at once, is
-    counted by number alone as long as it is not late.
-
-    index: of the newest sample, -1 before the first. due_ns: when that was due at the sender.
-    from_zero: the first index is the count of the sender, which begins with 1, where messages are
-    numbered, else 0. Otherwise it is the time of the first sample in periods, so that who is
-    restarted uses no index twice.
+    Stamps tell besides what was never published, or lost by a relay that renumbers; a sender that
+    keeps no time is counted by number alone unless it is late. index: of the newest sample, -1
+    before any. due_ns: when that was due. from_zero: the first index is the number of its message
+    less 1, or 0; else its time in periods, so that who is restarted uses no index twice.
     """
 
     def __init__(self, sample_period_s: float, from_zero: bool = True) -> None:
@@ -302,7 +286,6 @@ class SampleCounter:
         return Arrival(missing=missing, unsent=max(missing - skipped, 0) if known else 0)
 
     def _follow_phase(self, stamp_ns: int, missing: int, window: int) -> None:
-        """Go on to the sample with this stamp, before which so many are missing."""
         period, latenesses = self.sender.period_ns, self._lateness_ns
         expected = self.due_ns + period * (1 + missing)
         late = stamp_ns - expected
@@ -339,8 +322,5 @@ class SampleCounter:
 
 
 def kept_outputs(sample_period: float) -> int:
-    """How many outputs wait for a controller that is held up, which learns from all of them.
-
-    sample_period [s].
-    """
+    """How many outputs wait for a controller that is held up, which learns from all of them."""
     return round(max(0.1 / sample_period, 20))

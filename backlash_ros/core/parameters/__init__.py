@@ -80,7 +80,6 @@ class Parameters(ParameterTree, Mapping[str, Value]):
         self._of_joints = {joint: _of_joint(joint, shared, own[joint]) for joint in joints}
 
     def of_joint(self, joint: str) -> Parameters:
-        """Those of one of the `joints`, or of the only one, which may be nameless."""
         return self._of_joints[joint] if self._of_joints else self
 
     def __getitem__(self, name: str) -> Value:
@@ -99,7 +98,6 @@ class Parameters(ParameterTree, Mapping[str, Value]):
 
     @property
     def missing_limits(self) -> list[str]:
-        """Names of the limits of v that are infinite."""
         names = 'control.min', 'control.max', 'control.rate_max'
         return [name for name in names if self[name] == BY_NAME[name].default]
 

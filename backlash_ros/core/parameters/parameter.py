@@ -27,10 +27,10 @@ class ParameterError(ValueError):
 class Parameter:
     """A parameter. elements: the types of those of a list, with ... for any number of them.
 
-    low, high: bounds, of each element of a list. above: low itself is excluded. choices: the
-    allowed words, each with the one that it stands for. used_by: executables that read it. change:
-    'live' in a running node, in an 'unconfigured' controller, or 'never'. per_node: a controller
-    with several joints has it once.
+    low, high: bounds, of each element; above: low itself is excluded. choices: allowed words, each
+    with what it stands for. used_by: executables that read it. change: 'live' in a running node, in
+    an 'unconfigured' controller, or 'never'. per_node: a controller with several joints has it
+    once.
     """
 
     name: str
@@ -71,9 +71,9 @@ class Parameter:
 def option(
     default: Any, description: str, unit: str = '', choices: Iterable[str] = (), **rules: Any,
 ) -> Any:
-    """What a group says of a parameter, in place of its default.
+    """What a group says of a parameter, in place of its default; rules: fields of Parameter.
 
-    choices: words; 'OLD=NEW' is one that stands for another. rules: fields of Parameter.
+    choices: words; 'OLD=NEW' is one that stands for another.
     """
     words = {word: meant or word for word, _, meant in (each.partition('=') for each in choices)}
     return partial(Parameter, default=default, description=description, unit=unit, choices=words,
@@ -84,7 +84,6 @@ _types_in: Any = cache(get_type_hints)
 
 
 def declared_in(group: type[Any], prefix: str = '') -> Iterator[Parameter]:
-    """The parameters of a group and of the groups in it."""
     options = getattr(group, '_field_defaults', vars(group))
     for name, kind in _types_in(group).items():
         if isinstance(options.get(name), partial):
