@@ -1,4 +1,4 @@
-"""Parts of the loop: its phases, counts, lines of the log, period of a driver, joints."""
+"""Phases of a loop, counts, lines of the log, period of a driver, joints, jobs computed at once."""
 
 from collections.abc import Iterable, Mapping
 from itertools import product
@@ -6,7 +6,10 @@ from math import isnan
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from backlash_ros.core.jobs import ChannelSamples, Executor
 from backlash_ros.core.loop.control_loop import Event, Phase
 from backlash_ros.core.loop.diagnosis import AGAIN_S, LASTS_S, Finding, Level, LevelLog
 from backlash_ros.core.loop.loop_statistics import Lately, LoopStatistics
@@ -197,3 +200,32 @@ def test_changes_reach_the_joints_that_have_no_value_of_their_own() -> None:
     assert changed.of_joint('waist')['control.rate_max'] == 1.0
     assert changed.of_joint('wrist')['control.rate_max'] == 3.0
     assert changed.of_joint('elbow')['structure'] == 'proportional'
+
+
+def everything(samples: ChannelSamples, *more: object) -> tuple[object, ...]:
+    return samples.first, samples.columns.tolist(), *more
+
+
+@given(counts=st.lists(st.integers(0, 300), max_size=12), capacity=st.integers(1, 500))
+def test_a_job_sees_the_newest_samples_with_their_numbers(counts, capacity):
+    channel = Executor().open(2, capacity)
+    end = 0
+    for count in counts:
+        for k in range(end, end + count):
+            channel.append(k, -k)
+        end += count
+        assert channel.submit(everything, 'x')
+        channel.append(end, -end)
+        begin = max(end - capacity, 0)
+        numbers = range(begin, end)
+        assert channel.poll() == (begin, [[*numbers], [-k for k in numbers]], 'x')
+        end += 1
+
+
+def test_a_job_sees_no_samples_before_those_it_needs() -> None:
+    channel = Executor().open(1, 1000)
+    for k in range(20):
+        channel.append(k)
+    for since in (15, 19, 20):
+        channel.submit(everything, since=since)
+        assert channel.poll() == (since, [[*range(since, 20)]])
