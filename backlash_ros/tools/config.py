@@ -110,27 +110,24 @@ class Configuration:
 def read_configuration(
     config: Path | None, settings: Sequence[str] = (), seed: int | None = None,
 ) -> Configuration:
-    """Read and check everything; raises InputError and ParameterError.
-
-    config: a path, or the name of a shipped file; None for the paper's example.
-    """
+    """Read and check everything, as `find_config` finds it; raises InputError, ParameterError."""
     path = find_config(config)
-    sections = _read_sections(path)
-    parsed = [parse_setting(setting) for setting in settings]
-    axes, joints = (_listed(path, sections, name) for name in ('axes', 'joints'))
-    for _, name, value in parsed:
-        if name == 'axes' and isinstance(value, tuple):
-            axes = tuple(map(str, value))
+    sections, parsed = _read_sections(path), list(map(parse_setting, settings))
+    listed: dict[str, Any] = {
+        name: _merged(path, [each for each in sections if name in each.values]).get(name, ())
+        for name in ('axes', 'joints')
+    }
+    listed |= {name: value for _, name, value in parsed if name == 'axes'}
+    axes, joints = listed['axes'], listed['joints']
     for axis, name, _ in parsed:
         if axis and axis not in (axes or joints):
             raise InputError(f'--set {axis}/{name}: {_no_such_axis(axis, axes or joints)}')
     for section in sections:
-        if section.is_for(*axes or ('',)):
-            continue
-        rule = f': {_no_such_axis(section.axis, axes)}' if section.axis else (
-            f' belongs to no axis: write /{ANY}/{section.node} for all axes or '
-            f'/{axes[0]}/{section.node} for one')
-        raise InputError(f'{path}: section {section.name!r}{rule}')
+        if not section.is_for(*axes or ('',)):
+            rule = f': {_no_such_axis(section.axis, axes)}' if section.axis else (
+                f' belongs to no axis: write /{ANY}/{section.node} for all axes or '
+                f'/{axes[0]}/{section.node} for one')
+            raise InputError(f'{path}: section {section.name!r}{rule}')
     return Configuration(path, sections, parsed, seed, axes, () if axes else joints)
 
 
@@ -150,12 +147,11 @@ def parse_setting(text: str) -> Setting:
     check_names([name])
     if axis and name == 'axes':
         raise ParameterError(name, given, 'is for the whole run', 'write --set axes=...')
-    value: object = given
-    if not isinstance(BY_NAME[name].default, str):  # a word is taken as it is
-        try:
-            value = yaml.safe_load(given)
-        except yaml.YAMLError:
-            raise ParameterError(name, given, 'is not a value in YAML') from None
+    try:
+        # A word is taken as it is.
+        value = given if isinstance(BY_NAME[name].default, str) else yaml.safe_load(given)
+    except yaml.YAMLError:
+        raise ParameterError(name, given, 'is not a value in YAML') from None
     return Setting(axis, name, check_value(BY_NAME[name], value))
 
 
@@ -165,13 +161,6 @@ def _no_such_axis(axis: str, axes: Sequence[str]) -> str:
         return f'there is no axis {axis!r}: list it in the parameter axes under /{BRINGUP}'
     near = difflib.get_close_matches(axis, axes, n=1, cutoff=0.0)[0]
     return f'there is no axis {axis!r} among {", ".join(axes)}: did you mean {near}?'
-
-
-def _listed(path: Path, sections: Sequence[Section], parameter: str) -> tuple[str, ...]:
-    """The axes or joints that a file lists; raises InputError for two different lists."""
-    listing = [section for section in sections if parameter in section.values]
-    value = _merged(path, listing).get(parameter, ())
-    return tuple(map(str, value)) if isinstance(value, tuple) else ()
 
 
 def _merged(path: Path, sections: Sequence[Section]) -> dict[str, Value]:
@@ -195,17 +184,12 @@ class _StrictLoader(yaml.SafeLoader):
         for i, key in enumerate(keys):
             if key in keys[:i]:
                 raise yaml.constructor.ConstructorError(
-                    None, None, f'{key!r} is given twice', node.value[i][0].start_mark
-                )
+                    None, None, f'{key!r} is given twice', node.value[i][0].start_mark)
         return super().construct_mapping(node, deep=deep)
 
 
 def _read_sections(path: Path) -> list[Section]:
-    """Read and check a file.
-
-    Raises InputError for a file that cannot be read, ParameterError for a name or value that
-    breaks a rule; both name the file.
-    """
+    """Read and check a file; raises InputError and ParameterError, which name the file."""
     try:
         document = yaml.load(path.read_text(encoding='utf-8'), Loader=_StrictLoader)
     except OSError as error:
@@ -247,7 +231,16 @@ def flattened(tree: Mapping[object, object], prefix: str = '') -> Iterator[tuple
 
 def _checked(name: str, values: Mapping[str, object], joints: Sequence[str]) -> Section:
     """A section of a file; raises InputError for its name, ParameterError for what it holds."""
-    axis, node = _address(name)
+    axis, _, node = name.removeprefix('/').rpartition('/')
+    if name == f'/{ANY}':
+        axis = ANY
+    elif '/' in axis or not (node in NODES or (node == ANY and axis not in ('', ANY))):
+        known = [f'/{ANY}', *(f'/{each}' for each in NODES)]
+        similar = [f'/{axis}/{each}' for each in (*NODES, ANY)] if axis else known
+        near = difflib.get_close_matches(name, similar, n=1)
+        cure = f': did you mean {near[0]}?' if near else \
+            f', /AXIS/{ANY}, /AXIS/{CONTROLLER} ...' if axis else ''
+        raise InputError(f'section {name!r} is none of {", ".join(known)}{cure}')
     Parameters({'joints': joints, **values})  # checks all names and values
     checked = {}
     for key, value in values.items():
@@ -255,29 +248,11 @@ def _checked(name: str, values: Mapping[str, object], joints: Sequence[str]) -> 
         assert entry is not None
         checked[key] = check_value(entry, value)
         if node not in (ANY, *entry.used_by):
-            raise ParameterError(
-                key, checked[key], f'is not a parameter of {node}',
-                f'put it under /{ANY} or /{entry.used_by[0]}',
-            )
+            raise ParameterError(key, checked[key], f'is not a parameter of {node}',
+                                 f'put it under /{ANY} or /{entry.used_by[0]}')
         if key == 'axes' and axis not in (ANY, ''):
             raise ParameterError(key, value, 'is for the whole run', f'put it under /{BRINGUP}')
     return Section(name, axis, node, checked)
-
-
-def _address(name: str) -> tuple[str, str]:
-    """Axis and node of the name of a section."""
-    parts = name.removeprefix('/').split('/')
-    if name == f'/{ANY}':
-        return ANY, ANY
-    axis, node = parts[0] if parts[1:] else '', parts[-1]
-    if len(parts) <= 2 and (node in NODES or (node == ANY and axis not in ('', ANY))):
-        return axis, node
-    known = [f'/{ANY}', *(f'/{node}' for node in NODES)]
-    similar = [f'/{axis}/{node}' for node in (*NODES, ANY)] if axis else known
-    near = difflib.get_close_matches(name, similar, n=1)
-    cure = f': did you mean {near[0]}?' if near else \
-        f', /AXIS/{ANY}, /AXIS/{CONTROLLER} ...' if axis else ''
-    raise InputError(f'section {name!r} is none of {", ".join(known)}{cure}')
 
 
 class _Dumper(yaml.SafeDumper):
@@ -300,7 +275,8 @@ def config_text(parameters: Parameters) -> str:
     which ROS 2 does not have, are left out.
     """
     common = [p for p in BY_NAME.values() if p.used_by != (BRINGUP,) and parameters[p.name] != ()]
-    own = [p for p in BY_NAME.values() if p not in common and parameters[p.name] != p.default]
+    own = [p.name for p in BY_NAME.values()
+           if p not in common and parameters[p.name] != p.default]
     of_all = _tree(parameters, (p.name for p in common))
     for joint in parameters.joints:
         of_joint = parameters.of_joint(joint)
@@ -310,7 +286,7 @@ def config_text(parameters: Parameters) -> str:
         ))
     document = {f'/{ANY}': {'ros__parameters': of_all}}
     if own:
-        document[f'/{BRINGUP}'] = {'ros__parameters': _tree(parameters, (p.name for p in own))}
+        document[f'/{BRINGUP}'] = {'ros__parameters': _tree(parameters, own)}
     return yaml.dump(document, Dumper=_Dumper, sort_keys=False, width=1000)
 
 
