@@ -46,6 +46,7 @@ OUTCOME_COLUMNS = (
 # What a run came to, under OUTCOME_COLUMNS: nothing where a number is unknown or never reached;
 # problem: why it broke off, '' where it did not.
 Outcome = Mapping[str, float | str | None]
+Finished = Generator[tuple[int, Outcome], None, None]  # number of a job, what it came to
 
 
 class Job(NamedTuple):
@@ -56,7 +57,7 @@ class Job(NamedTuple):
 
 
 class ParameterStatistics(NamedTuple):
-    """Statistics of one estimated parameter over runs.
+    """Of one estimated parameter over runs.
 
     settling times [s]: inf for never. within: share of runs within 1 % at the end.
     """
@@ -86,9 +87,8 @@ def combinations(texts: Sequence[str]) -> list[dict[str, Value]]:
         except yaml.YAMLError:
             raise InputError(f'--sweep {text!r}: the values are no list in YAML') from None
         of_words = isinstance(BY_NAME[name].default, str)
-        sweeps[name] = [
-            check_value(BY_NAME[name], str(value) if of_words else value) for value in values
-        ]
+        sweeps[name] = [check_value(BY_NAME[name], str(value) if of_words else value)
+                        for value in values]
     products = itertools.product(*sweeps.values())
     return [dict(zip(sweeps, values, strict=True)) for values in products]
 
@@ -139,18 +139,16 @@ def run_jobs(
         _in_processes(jobs, workers) if workers > 1 else \
         ((i, run_job(job)) for i, job in enumerate(jobs))
     # disable=None: no bar where stderr is not a terminal.
-    bar = tqdm(finished, desc=label, total=len(jobs), unit='run', disable=None)
-    with closing(finished), bar:
+    with closing(finished), \
+            tqdm(finished, desc=label, total=len(jobs), unit='run', disable=None) as bar:
         outcomes = dict(bar)
     return [outcomes[i] for i in range(len(jobs))]
 
 
-def _in_processes(jobs: Sequence[Job], workers: int) -> Generator[tuple[int, Outcome], None, None]:
-    """Number and outcome of each job, as they come."""
+def _in_processes(jobs: Sequence[Job], workers: int) -> Finished:
     os.environ.update(ONE_THREAD)  # read when a worker imports numpy
     executor = ProcessPoolExecutor(
-        workers, multiprocessing.get_context('spawn'), initializer=_end_with_parent
-    )
+        workers, multiprocessing.get_context('spawn'), initializer=_end_with_parent)
     try:
         # A signal that would cut short the start of a worker takes effect afterwards, whichever
         # thread gets it.
@@ -187,19 +185,15 @@ def _end_with_parent() -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def _on_cluster(jobs: Sequence[Job], address: str) -> Generator[tuple[int, Outcome], None, None]:
-    """Number and outcome of each job, as they come.
+def _on_cluster(jobs: Sequence[Job], address: str) -> Finished:
+    """A run whose worker is lost is given to another one. address: as tcp://HOST:PORT.
 
-    A run whose worker is lost is given to another one. address: of the scheduler, as tcp://HOST:PORT.
     Raises InputError where there is no such cluster, or one with other libraries; BrokenOffError
     where it ends before the runs do, or a run has ended several workers.
     """
-    def refused(why: str) -> InputError:
-        return InputError(f'--cluster {address}: {why}')
-
     try:
         from distributed import Client, KilledWorker
-        from distributed import TimeoutError as NoWorkerError
+        from distributed import TimeoutError as NoAnswerError
         from distributed import as_completed as completed
     except ImportError:
         raise InputError(
@@ -207,40 +201,30 @@ def _on_cluster(jobs: Sequence[Job], address: str) -> Generator[tuple[int, Outco
         ) from None
     # The errors below say in one line what the user needs to know.
     logging.getLogger('distributed').setLevel(logging.CRITICAL)
+    here, there = libraries(), f'--cluster {address}'
     try:
-        client = Client(address, timeout=CLUSTER_ANSWER_S, set_as_default=False)
-    except (OSError, ValueError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise refused(
-            f'no scheduler answers ({reason}): start one with `dask scheduler --host HOST`, and '
-            'workers with `dask worker tcp://HOST:8786`'
-        ) from None
-    with client:
-        try:
+        with Client(address, timeout=CLUSTER_ANSWER_S, set_as_default=False) as client:
             client.wait_for_workers(1, timeout=CLUSTER_ANSWER_S)
             for worker, found in client.run(libraries).items():
-                if found != libraries():
-                    raise refused(
-                        f'{worker} has {found}, here is {libraries()}: install the same versions, '
-                        'else the last digits differ'
-                    )
+                if found != here:
+                    raise InputError(f'{there}: {worker} has {found}, here is {here}: install the '
+                                     'same versions, else the last digits differ')
             # Not pure: runs of the same parameters are runs all the same.
             futures = client.map(run_job, jobs, pure=False)
             numbers = {future.key: i for i, future in enumerate(futures)}
             for future, outcome in completed(futures, loop=client.loop, with_results=True):
                 yield numbers[future.key], outcome
-        except NoWorkerError:
-            raise refused(
-                f'no worker within {CLUSTER_ANSWER_S:g} s: start some with `dask worker {address}`'
-            ) from None
-        except ImportError as error:
-            raise refused(
-                f'a worker says {error}: install the same backlash_ros there') from None
-        except (KilledWorker, CancelledError) as error:
-            why = 'a run has ended several workers: is there enough memory?' \
-                if isinstance(error, KilledWorker) else \
-                'the scheduler has ended: start it and simulate again'
-            raise BrokenOffError(f'--cluster {address}: {why}') from None
+    except InputError:
+        raise
+    except (KilledWorker, CancelledError):
+        raise BrokenOffError(f'{there}: a run has ended several workers, or the scheduler has '
+                             'ended: is there enough memory?') from None
+    except (OSError, ValueError, ImportError, NoAnswerError) as error:
+        reason = ' '.join(str(error).split()) or type(error).__name__
+        raise InputError(
+            f'{there}: {reason}: start a scheduler with `dask scheduler --host HOST`, and workers '
+            'that have this backlash_ros with `dask worker tcp://HOST:8786`'
+        ) from None
 
 
 def libraries() -> dict[str, str]:

@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
-from math import isfinite
+from math import inf
 
 from tqdm import tqdm
 
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.loop.diagnosis import Learning, LoopFigures, Neighbours, state_beside
 from backlash_ros.core.loop.sample_counter import Timing
-from backlash_ros.core.parameters import Parameters, Value, as_yaml
+from backlash_ros.core.parameters import Parameters, as_yaml
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.options import OptionParser
 from backlash_ros.tools import batch, cli
-from backlash_ros.tools.batch import OUTCOME_COLUMNS, Outcome, statistics
-from backlash_ros.tools.cli import NOTHING, InputError, format_table
+from backlash_ros.tools.cli import NOTHING, InputError
 from backlash_ros.tools.config import effective_parameters, write_config
 from backlash_ros.tools.runs.files import CONFIG_FILE, Run, result_directory, write_table
 from backlash_ros.tools.runs.read_run import run_loop
@@ -29,8 +28,7 @@ from backlash_ros.topics import BACKLASH
 def make_parser() -> argparse.ArgumentParser:
     parser = OptionParser('simulate', description=__doc__)
     cli.add_options(
-        parser, '--config', '--set', '--axis', '--seed', '--out', '--duration', '--sweep'
-    )
+        parser, '--config', '--set', '--axis', '--seed', '--out', '--duration', '--sweep')
     parser.add_argument('--seeds', type=int, metavar='N', help='run N seeds, from --seed on, in '
                         'parallel and print their statistics')
     parser.add_argument('--cluster', metavar='ADDRESS', help='let the workers of this Dask '
@@ -56,7 +54,8 @@ def _once(parameters: Parameters, options: argparse.Namespace) -> None:
     samples = cli.number_of_samples(parameters, options.duration)
     loop = build_closed_loop(parameters)
     cli.print_warnings('simulate', parameters)
-    _refuse_bad_out(options)
+    if options.out is not None:
+        result_directory(options.out)  # fails before a long run, not after it
     # disable=None: no bar where stderr is not a terminal.
     with tqdm(total=samples, desc='simulate', unit='sample', disable=None) as bar:
         run = run_loop(loop, samples, lambda _: bar.update())
@@ -72,12 +71,6 @@ def _once(parameters: Parameters, options: argparse.Namespace) -> None:
     print(f'report: {directory / REPORT_PAGE}')
 
 
-def _refuse_bad_out(options: argparse.Namespace) -> None:
-    """Fail before a long run, not after it; a folder of its own is made only for a whole run."""
-    if options.out is not None:
-        result_directory(options.out)
-
-
 def _many(parameters: Parameters, options: argparse.Namespace) -> None:
     changes = batch.combinations(options.sweep)
     swept = list(changes[0])
@@ -85,55 +78,42 @@ def _many(parameters: Parameters, options: argparse.Namespace) -> None:
         raise InputError('--seeds and --sweep seed=... exclude each other')
     seeds = range(parameters.seed, parameters.seed + (options.seeds or 1))
     jobs = batch.make_jobs(parameters, changes, seeds, options.duration)
-    _refuse_bad_out(options)
+    if options.out is not None:
+        result_directory(options.out)
     outcomes = batch.run_jobs(jobs, cluster=options.cluster, label='simulate')
     directory = result_directory(options.out)
     write_config(parameters, directory / CONFIG_FILE)
     csv = directory / ('sweep.csv' if swept else 'seeds.csv')
-    write_table(csv, (*swept, 'seed', *OUTCOME_COLUMNS), [
+    write_table(csv, (*swept, 'seed', *batch.OUTCOME_COLUMNS), [
         [*(list(value) if isinstance(value := job.values[name], tuple) else value
            for name in (*swept, 'seed')), *outcome.values()]
         for job, outcome in zip(jobs, outcomes, strict=True)
     ])
     size = len(outcomes) // len(changes)  # the jobs of one change stand together
-    print(_table(changes, [outcomes[i * size:][:size] for i in range(len(changes))]))
-    ended = [(job.values['seed'], outcome) for job, outcome in zip(jobs, outcomes, strict=True)]
-    for what, of in (
-        ('broke off', [(seed, each['problem']) for seed, each in ended if each['problem']]),
-        ('not within 1 % at the end', [
-            (seed, '') for seed, each in ended if not each['problem']
-            and any(each[f'settling_{name}'] is None for name in BACKLASH)
-        ]),
-    ):
-        if of:
-            named = list(dict.fromkeys(str(seed) for seed, _ in of))
-            shown = ', '.join(named[:10]) + (', ...' if len(named) > 10 else '')
-            why = f', the first one with: {of[0][1]}' if of[0][1] else ''
-            print(f'{what}: {len(of)} run{"s" if len(of) > 1 else ""}, seed {shown}{why}')
-    print(f'runs: {csv}')
-
-
-def _table(changes: Sequence[Mapping[str, Value]], groups: Sequence[Sequence[Outcome]]) -> str:
-    """Statistics of each parameter over the runs of each change.
-
-    Raises InputError where all runs of the only change broke off.
-    """
     rows = []
-    for change, outcomes in zip(changes, groups, strict=True):
-        swept = list(map(as_yaml, change.values()))
-        if len(changes) > 1 and all(outcome['problem'] for outcome in outcomes):
-            rows.append([*swept, 'broke off', *[NOTHING] * 5])
+    for i, change in enumerate(changes):
+        group, values = outcomes[i * size:][:size], list(map(as_yaml, change.values()))
+        if len(changes) > 1 and all(outcome['problem'] for outcome in group):
+            rows.append([*values, 'broke off', *[NOTHING] * 5])
             continue
         rows += [[
-            *swept, name, f'{s.bias:+.3g}', f'{s.rmse:.3g}', _seconds(s.settling_median),
-            _seconds(s.settling_max), f'{100.0 * s.within:.4g} %',
-        ] for name, s in statistics(outcomes).items()]
-    return format_table([*changes[0], '', 'bias', 'RMSE', 'settled, median', 'settled, last',
-                         'within 1 %'], rows)
-
-
-def _seconds(time: float) -> str:
-    return f'{time:.4g} s' if isfinite(time) else 'never'
+            *values, name, f'{s.bias:+.3g}', f'{s.rmse:.3g}',
+            *('never' if time == inf else f'{time:.4g} s'
+              for time in (s.settling_median, s.settling_max)), f'{100.0 * s.within:.4g} %',
+        ] for name, s in batch.statistics(group).items()]
+    print(cli.format_table([*swept, '', 'bias', 'RMSE', 'settled, median', 'settled, last',
+                            'within 1 %'], rows))
+    named: dict[str, list[str]] = {}
+    for job, outcome in zip(jobs, outcomes, strict=True):
+        what = f'broke off ({outcome["problem"]})' if outcome['problem'] else \
+            'not within 1 % at the end'
+        if outcome['problem'] or None in [outcome[f'settling_{name}'] for name in BACKLASH]:
+            named.setdefault(what, []).append(str(job.values['seed']))
+    for what, of in named.items():
+        shown = list(dict.fromkeys(of))
+        print(f'{what}: {len(of)} run{"s" if len(of) > 1 else ""}, seed {", ".join(shown[:10])}'
+              f'{", ..." if len(shown) > 10 else ""}')
+    print(f'runs: {csv}')
 
 
 main = partial(cli.run_tool, 'simulate', _simulate)
