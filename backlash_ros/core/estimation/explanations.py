@@ -13,8 +13,13 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Bounds
 from backlash_ros.core.estimation import settings
-from backlash_ros.core.estimation.fit import FEW_STEPS, FIRST_STEPS, Problem
-from backlash_ros.core.estimation.noise import with_intervals, with_walk
+from backlash_ros.core.estimation.fit import (
+    FEW_STEPS,
+    FIRST_STEPS,
+    Problem,
+    with_intervals,
+    with_walk,
+)
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.posterior import Prior, Start, WindowFit
 from backlash_ros.core.estimation.search import search

@@ -1,14 +1,11 @@
-"""The fit of all unknowns to a record: Gauss-Newton steps with exact derivatives.
+"""The fit of all unknowns to a record: Gauss-Newton steps with exact derivatives, each one QR.
 
     y = G(z; xi) [m p(v; g, p0) - o + d] + X / A(z; xi) + e,   o = m c_r,   xi ~ N(0, s^2)
 
-Unknowns are the state X before the record, the knots of a disturbance d that walks to 0 at its end
-(o is that of its end), where the play began (p0), the slope m, the offset o, the gap g, and xi
-(plant_family.py). A step solves the linearized least squares by QR; the scale s and the noise are
-integrated out in closed form (Normal-Gamma) over a grid of s, whose prior is log-normal around 1:
-G is about as wrong as configured. A leak has a prior of its own. The derivatives by g and p0 are
-those of the play: 1 where the left side was engaged last, and where none was. What older samples
-say is rows (R, d) on theta = (m, o, g, xi).
+X: state before the record. d: disturbance that walks to 0 at its end (o is that of its end). p0, g:
+beginning and gap of the play. The noise and the scale s are integrated out in closed form (Normal-
+Gamma) over a grid of s, whose prior is log-normal around 1: G is about as wrong as configured. The
+derivatives by g and p0 are 1 where the left side was engaged last, and where none was.
 """
 
 from __future__ import annotations
@@ -20,22 +17,11 @@ from math import inf, isfinite, log, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
+from backlash_ros.core.estimation import posterior, settings
 from backlash_ros.core.estimation.plant_family import Family, delayed, padded, sensitivities
-from backlash_ros.core.estimation.posterior import (
-    Left,
-    Likelihood,
-    Prior,
-    Start,
-    WindowFit,
-    error_of_plant,
-    independence,
-    likelihood,
-    step_of,
-)
+from backlash_ros.core.estimation.posterior import Prior, WindowFit
 from backlash_ros.core.plant.backlash import Region, engaged, play, reversals
-from backlash_ros.core.plant.numerics import lfilter
-
-Array = NDArray[np.float64]
+from backlash_ros.core.plant.numerics import Array, lfilter
 
 STEPS, FIRST_STEPS, FEW_STEPS = 16, 6, 3  # of Gauss-Newton, at most
 
@@ -59,14 +45,8 @@ class Run:
     begins: NDArray[np.intp]
 
     @cached_property
-    def likelihood(self) -> Likelihood:
-        """That of the readings."""
-        return likelihood(self.error, self.fit.noise_std, self.fit.step)
-
-    def is_of(self, f: WindowFit) -> bool:
-        """Whether these are the values of a fit, its noise left aside."""
-        return (f.x is self.fit.x and f.theta is self.fit.theta and f.knots is self.fit.knots
-                and f.p0 == self.fit.p0)
+    def likelihood(self) -> posterior.Likelihood:
+        return posterior.likelihood(self.error, self.fit.noise_std, self.fit.step)
 
 
 class Problem:
@@ -77,32 +57,33 @@ class Problem:
     """
 
     def __init__(
-        self, family: Family, v: Array, y: Array, noise_std: float,
-        older: Prior | None = None, start: Start | None = None, step: float | None = None,
+        self, family: Family, v: Array, y: Array, noise_std: float, older: Prior | None = None,
+        start: posterior.Start | None = None, step: float | None = None,
     ) -> None:
         self.family, self.v, self.nominal = family, v, noise_std
         self.older, self.start = older, start
         self.known = np.isfinite(y)
         self.y = np.where(self.known, y, 0.0)
-        self.step_of_readings = step_of(y) if step is None else step
+        self.step_of_readings = posterior.step_of(y) if step is None else step
         self._newest: list[Run] = []  # of which nothing is computed again
-
-    # --- the model -----------------------------------------------------------------------------
 
     def at(self, f: WindowFit) -> Run:
         """The record by the values of this fit."""
-        run = next((run for run in self._newest if run.is_of(f)), None)
-        if run is None:
+        for run in self._newest:
+            g = run.fit
+            if f.x is g.x and f.theta is g.theta and f.knots is g.knots and f.p0 == g.p0:
+                if (f.noise_std, f.step) == (g.noise_std, g.step):
+                    return run
+                run = replace(run, fit=f)
+                break
+        else:
             p = play(self.v, max(f.gap, 0.0), f.p0)
-            u = f.m * p - f.theta[1] + self._knots(f) @ self._hats(f)
+            hats, knots, _ = self._walk_of(f)
+            u = f.m * p - f.theta[1] + knots @ hats
             b, a = self.family.at(f.xi)
             y = lfilter(b, a, u, padded(f.x, len(a) - 1))
-            run = Run(f, b, a, p, u, y, (self.y - y) * self.known,
-                      *independence(self.y, self.known, y, self.step_of_readings))
-        elif (f.noise_std, f.step) != (run.fit.noise_std, run.fit.step):
-            run = replace(run, fit=f)
-        else:
-            return run
+            run = Run(f, b, a, p, u, y, (self.y - y) * self.known, *posterior.independence(
+                self.y, self.known, y, self.step_of_readings))
         self._newest = [run, *self._newest[:2]]
         return run
 
@@ -118,41 +99,38 @@ class Problem:
         place = np.arange(count) * knots / max(count - 1, 1)
         return np.asarray(np.maximum(1.0 - np.abs(place - np.arange(knots)[:, None]), 0.0))
 
-    def _hats(self, f: WindowFit) -> Array:
-        """The same, or none where u does not walk."""
-        return self._walk if f.walk_std else np.zeros((0, len(self.v)))
-
-    def _knots(self, f: WindowFit) -> Array:
-        count = len(self._hats(f))
-        return f.knots if len(f.knots) == count else np.zeros(count)
-
-    def _knot_std(self, f: WindowFit) -> float:
-        """Standard deviation of what d moves by from one knot to the next."""
-        return f.walk_std * sqrt(len(self.v) / len(self._walk))
+    def _walk_of(self, f: WindowFit) -> tuple[Array, Array, float]:
+        """The same, none where u does not walk; values of the knots; std of their differences."""
+        if not f.walk_std:
+            return np.zeros((0, len(self.v))), np.zeros(0), 1.0
+        knots = f.knots if len(f.knots) == len(self._walk) else np.zeros(len(self._walk))
+        return self._walk, knots, f.walk_std * sqrt(len(self.v) / len(self._walk))
 
     def log_posterior(self, f: WindowFit, w: Array | None = None) -> float:
         """Of these values but for constants; -inf where it is no number.
 
         w: weights of the readings (N,), the same for all that are compared; None: those of f.
         """
+        leak, xi = f.theta[3:3 + self.family.leaks], f.theta[3 + self.family.leaks:]
         with np.errstate(all='ignore'):
             run = self.at(f)
             w = run.weights if w is None else w
-            value = f.log_prior(self.older, self.family.leaks)
+            squares = float(xi @ xi) / f.scale**2 + float(leak @ leak)
+            if self.older is not None:
+                squares += float(np.sum((self.older.rows @ f.theta - self.older.values) ** 2))
+            value = -0.5 * (squares + log(f.scale) ** 2) - len(xi) * log(f.scale)
             if f.step:
                 value += float(w @ run.likelihood.log_density)
             else:
                 squares, count = float((w * run.error) @ run.error), float(w.sum()) + 1.0
                 value -= 0.5 * count * log((squares + self.nominal**2) / count)
-            if f.walk_std:
-                moves = np.diff(self._knots(f), append=0.0) / self._knot_std(f)
-                value -= 0.5 * float(moves @ moves)
+            _, knots, knot_std = self._walk_of(f)
+            moves = np.diff(knots, append=0.0) / knot_std
+            value -= 0.5 * float(moves @ moves)
         return value if isfinite(value) else -inf
 
-    # --- a Gauss-Newton step --------------------------------------------------------------------
-
     def step(
-        self, f: WindowFit, most_scale: float = np.inf, held: bool = False, begun: bool = False,
+        self, f: WindowFit, most_scale: float = inf, held: bool = False, begun: bool = False,
     ) -> WindowFit:
         """The values that the linearization around f makes likeliest, with their posterior.
 
@@ -174,7 +152,7 @@ class Problem:
         of_xi[:n] = -of_eta[:n] @ r[:n, n:-1]
         freedom = max(float(run.weights.sum()) - n, 0.0) + 1.0
         squares = float(r[size, size]) ** 2 + (self.nominal / f.noise_std) ** 2
-        xi, cov_xi, scale, volume, noise = error_of_plant(
+        xi, cov_xi, scale, volume, noise = posterior.error_of_plant(
             f, r[n:, n:], squares, freedom, most_scale)
         beta = of_eta @ r[:n, -1] + of_xi @ xi
         swing, first = float(np.ptp(self.v)), float(self.v[0])
@@ -182,12 +160,11 @@ class Problem:
         p0 = float(beta[at - 1])
         cov = noise * of_eta @ of_eta.T + of_xi @ cov_xi @ of_xi.T
         volume -= float(np.log(np.maximum(diagonal, 1e-300)).sum())
-        if f.walk_std:
-            volume -= len(self._walk) * log(self._knot_std(f))
+        _, knots, knot_std = self._walk_of(f)
         return replace(
             f, x=beta[:order], knots=beta[order:at - 1], theta=beta[at:],
             p0=p0 if self.start is not None else min(max(p0, first), first + gap),
-            scale=scale, cov=cov[at:, at:], volume=volume,
+            scale=scale, cov=cov[at:, at:], volume=volume - len(knots) * log(knot_std),
         )
 
     def remembered(self, f: WindowFit) -> Prior:
@@ -204,17 +181,37 @@ class Problem:
         return np.asarray(np.triu(dgeqrf(rows, overwrite_a=1)[0][:rows.shape[1]]))
 
     def rows(self, f: WindowFit, held: bool = False, begun: bool = False) -> Array:
-        """The least squares of a step: a row for each sample, then those beside, the target last.
+        """The least squares of a step: a row for each sample, then those of what is known beside.
 
-        Readings have deviation 1 in it, shape (N + B, P + 1). held, begun: as above.
+        Readings have deviation 1 in it, the target is the last column: shape (N + B, P + 1).
         """
-        run, jacobian = self.at(f), self.jacobian(f)
+        vague = 100.0  # prior deviation of the state before a record, over the largest reading
+        tight = 1e6  # weight of what is held
+        run, jacobian, first = self.at(f), self.jacobian(f), self.v[0]
         _, score, information = run.likelihood
-        x = padded(f.x, len(run.a) - 1)
-        beta = np.concatenate([x, self._knots(f), [f.p0], f.theta])
+        (_, knots, knot_std), x = self._walk_of(f), padded(f.x, len(run.a) - 1)
+        beta = np.concatenate([x, knots, [f.p0], f.theta])
         of_samples = np.vstack([jacobian.T, jacobian @ beta + score / information])
         of_samples *= np.sqrt(information * run.weights)
-        return np.hstack([of_samples, self._beside(f, len(x), held, begun).T]).T
+        at, last_knot = len(x) + len(knots) + 1, len(x) + len(knots) - 1  # at: place of m
+        *unit, target = np.eye(len(beta) + 1)
+        p0, gap = unit[at - 1], unit[at + 2]
+        begin = tight * (p0 - self.start.left * gap + self.start.v * target) if self.start \
+            else sqrt(12.0) / max(f.gap, 1e-9) * (p0 + (first + 0.5 * f.gap) * target)
+        beside = [
+            # The gap is within the swing; p0 is anywhere within the gap of now.
+            tight * (gap + f.gap * target) if held else gap / max(float(np.ptp(self.v)), 1e-300),
+            tight * (p0 + f.p0 * target) if begun else begin,
+            *unit[at + 3:at + 3 + self.family.leaks],
+            # What no reading tells, as where the first were lost, would grow without bounds.
+            *(row / (vague * max(float(np.abs(self.y).max()), 1e-300)) for row in unit[:len(x)]),
+            *((unit[k] - (k < last_knot) * unit[k + 1]) / knot_std
+              for k in range(len(x), last_knot + 1)),
+        ]
+        if self.older is not None:
+            before = np.zeros((len(self.older.rows), at))
+            beside.extend(np.column_stack([before, self.older.rows, self.older.values]))
+        return np.hstack([of_samples, np.array(beside).T]).T
 
     def normalised(self, f: WindowFit) -> Array:
         """Residuals of deviation 1, or what stands for them with intervals (N,); 0 where lost."""
@@ -228,39 +225,12 @@ class Problem:
         # A side that has not moved p yet leaves it where it began.
         side[:int(np.argmax(np.append(run.p != f.p0, True)))] = Region.GAP
         over_a = lfilter([1.0], run.a, np.vstack([
-            self._hats(f), f.m * (side == Region.GAP), run.p, np.full(count, -1.0),
+            self._walk_of(f)[0], f.m * (side == Region.GAP), run.p, np.full(count, -1.0),
             f.m * (side == Region.LEFT), run.u, run.y, np.eye(1, count)]))
         *_, u, y, impulse = over_a
         return np.vstack([
             delayed(impulse, len(run.a) - 1), lfilter(run.b, [1.0], over_a[:-3]),
             sensitivities(self.family, f.xi, u, y)]).T
-
-    def _beside(self, f: WindowFit, order: int, held: bool, begun: bool) -> Array:
-        """Rows (B, P + 1) of what is known beside the samples, the target in the last column."""
-        vague = 100.0  # prior deviation of the state before a record, over the largest reading
-        tight = 1e6  # weight of what is held
-        walks, leaks, older, first = len(self._hats(f)), self.family.leaks, self.older, self.v[0]
-        at = order + walks + 1  # place of m
-        *unit, target = np.eye(at + 4 + self.family.count)
-        p0, gap = unit[at - 1], unit[at + 2]
-        begin = tight * (p0 - self.start.left * gap + self.start.v * target) if self.start \
-            else sqrt(12.0) / max(f.gap, 1e-9) * (p0 + (first + 0.5 * f.gap) * target)
-        rows = [
-            # The gap is within the swing; p0 is anywhere within the gap of now.
-            tight * (gap + f.gap * target) if held else gap / max(float(np.ptp(self.v)), 1e-300),
-            tight * (p0 + f.p0 * target) if begun else begin,
-            *unit[at + 3:at + 3 + leaks],
-            # What no reading tells, as where the first were lost, would grow without bounds.
-            *(x / (vague * max(float(np.abs(self.y).max()), 1e-300)) for x in unit[:order]),
-            *((unit[k] - (k + 1 < order + walks) * unit[k + 1]) / self._knot_std(f)
-              for k in range(order, order + walks)),
-        ]
-        if older is not None:
-            before = np.zeros((len(older.rows), at))
-            rows.extend(np.column_stack([before, older.rows, older.values]))
-        return np.array(rows)
-
-    # --- the fit --------------------------------------------------------------------------------
 
     def fitted(self, f: WindowFit, steps: int = STEPS) -> WindowFit:
         """Gauss-Newton steps from f until they move nothing, halved where they go too far."""
@@ -270,7 +240,7 @@ class Problem:
             weights = self.at(f).weights
             best = self.log_posterior(f, weights)
             # Far from the optimum the error of the linearization passes for one of G.
-            most = 1.0 if k < far_steps < steps else np.inf
+            most = 1.0 if k < far_steps < steps else inf
             new, there, value = self._stepped(f, best, weights, most)
             if not value > best - 0.5:
                 # A kink where the play began bars the way to all else: held there, it does not.
@@ -298,20 +268,31 @@ class Problem:
         """What a step leads to, where it goes as far as that helps, and its log-posterior."""
         shortest_step = 0.05  # share of a Gauss-Newton step that is tried
         new = self.step(f, most_scale, begun=begun)
-        there = _towards(f, new)
+        there = self._towards(f, new)
         value = self.log_posterior(there, weights)
         if -inf < value <= best - 0.5:
             # Beyond a kink of the play, where another side was engaged, it may be better.
-            again = _towards(there, self.step(there, most_scale, begun=begun))
+            again = self._towards(there, self.step(there, most_scale, begun=begun))
             of_again = self.log_posterior(again, weights)
             if of_again > best:
                 there, value = again, of_again
         length = 1.0
         while not value > best - 0.5 and length > shortest_step:
             length *= 0.3
-            there = _towards(f, new, length)
+            there = self._towards(f, new, length)
             value = self.log_posterior(there, weights)
         return new, there, value
+
+    def _towards(self, f: WindowFit, new: WindowFit, share: float = 1.0) -> WindowFit:
+        """The values this share of the way from f to new, with the posterior of new."""
+        longest = 2.0  # prior deviations by which G moves at once
+        furthest = float(np.abs(new.theta[3:] - f.theta[3:]).max(initial=0.0))
+        length = share * min(longest / max(furthest, longest), 1.0)
+        order, knots = max(len(f.x), len(new.x)), self._walk_of(f)[1]
+        x = padded(f.x, order)
+        return replace(
+            new, x=x + length * (padded(new.x, order) - x), knots=knots + length * (new.knots - knots),
+            p0=f.p0 + length * (new.p0 - f.p0), theta=f.theta + length * (new.theta - f.theta))
 
     def _noise_of(self, f: WindowFit) -> float:
         run = self.at(f)
@@ -334,7 +315,7 @@ class Problem:
         value = float(w @ density) + float(w.sum()) * log(self.step_of_readings or self.nominal)
         turns = len(reversals(engaged(self.v, run.p, max(f.gap, 0.0))))
         rms = sqrt(float(run.error @ run.error) / max(int(known.sum()), 1))
-        return replace(f, left=Left(value, rms, rho, count, turns))
+        return replace(f, left=posterior.Left(value, rms, rho, count, turns))
 
     def begun(self, f: WindowFit, offset: bool = False) -> WindowFit:
         """The same with the state before the record, and o if that is asked, at their best."""
@@ -348,15 +329,52 @@ class Problem:
         return replace(f, x=best[:len(run.a) - 1], theta=theta)
 
 
-def _towards(f: WindowFit, new: WindowFit, share: float = 1.0) -> WindowFit:
-    """The values this share of the way from f to new, with the posterior of new."""
-    longest = 2.0  # prior deviations by which G moves at once
-    furthest = float(np.abs(new.theta[3:] - f.theta[3:]).max(initial=0.0))
-    length = share * min(longest / max(furthest, longest), 1.0)
-    order = max(len(f.x), len(new.x))
-    old, x = padded(f.x, order), padded(new.x, order)
-    knots = f.knots if len(f.knots) == len(new.knots) else np.zeros(len(new.knots))
-    return replace(
-        new, x=old + length * (x - old), knots=knots + length * (new.knots - knots),
-        p0=f.p0 + length * (new.p0 - f.p0), theta=f.theta + length * (new.theta - f.theta),
-    )
+def with_intervals(p: Problem, f: WindowFit) -> WindowFit:
+    """The finished fit, by intervals where readings have a step that the noise does not hide.
+
+    The noise beside the rounding is the likeliest of a grid, but as large as leaves a
+    reading near an edge of its interval for every unknown: fewer are no normal posterior.
+    """
+    step, unknowns = p.step_of_readings, len(f.x) + len(f.knots) + 1 + len(f.theta)
+    largest = 0.25 * step
+    edges = unknowns / max(float(p.at(f).weights.sum()), 1.0)
+    least = min(step * max(1.0 / 64.0, edges), largest)
+    if not step or f.m <= 0.0 or (not f.step and f.noise_std > 0.75 * step):
+        return p.finished(f)
+
+    def at(level: float, begin: WindowFit) -> WindowFit:
+        return p.finished(p.fitted(replace(begin, step=step, noise_std=level), FEW_STEPS))
+
+    first = max(min(f.noise_std if f.step else largest, largest), least)
+    best = at(first, f)
+    for factor in (0.5, 2.0):
+        if best.noise_std < first:
+            break
+        while least <= factor * best.noise_std <= largest:
+            other = at(factor * best.noise_std, best)
+            if other.evidence <= best.evidence:
+                break
+            best = other
+    return best if best.left.rms < 1.5 * f.noise else p.finished(p.fitted(f.without_intervals))
+
+
+def with_walk(p: Problem, f: WindowFit, least: float) -> WindowFit:
+    """The fit, or one where u walks as well if that explains why residuals are correlated.
+
+    One that walks already is compared with one that does not in the same way. least: walk that is
+    configured, per square root of a sample.
+    """
+    best, begin = f, replace(f.without_intervals, knots=np.zeros(0), walk_std=least)
+    if f.walk_std != least:
+        best = with_intervals(p, p.fitted(begin))
+    if not best.valid or not best.systematic:
+        return best
+    for share in (0.005, 0.02, 0.08):  # of m times the gap, by which u may walk over the record
+        walk_std = share * f.m * f.gap / sqrt(len(p.v))
+        if walk_std > least:
+            g = with_intervals(p, p.fitted(replace(begin, walk_std=walk_std), FIRST_STEPS))
+            needed = 0.0 if best.walk_std > least else settings.FAR_BEHIND
+            # Readings of which the walk leaves a correlated rest count as fewer.
+            if g.valid and g.evidence - best.evidence > needed * g.inflation:
+                best = g
+    return best

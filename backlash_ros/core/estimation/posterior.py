@@ -1,17 +1,11 @@
 """What a reading of y says of the output, and what a fit of many has found.
 
-A reading of a sensor without a step is normal around the output. One with a step delta says that
-the output, blurred by noise of deviation sigma, lies within half a step of it:
+One reading is normal around the output. With a step delta it says that the output, blurred by noise
+of deviation sigma, lies within half a step of it (L. Y. Wang, G. G. Yin, J.-F. Zhang, Y. Zhao,
+System Identification with Quantized Observations, Birkhaeuser 2010):
 
     P(y | output) = [Phi((r + delta/2) / sigma) - Phi((r - delta/2) / sigma)] / delta
     r = y - output
-
-Readings that repeat while the output stands still repeat one rounding: they are one reading.
-Residuals that are correlated do not average out: with rho of theirs, N count as
-N / (1 - rho + N rho) independent ones. The scale of the error of G is integrated out on a grid.
-
-Reference: L. Y. Wang, G. G. Yin, J.-F. Zhang, Y. Zhao, System Identification with Quantized
-Observations, Birkhaeuser 2010.
 """
 
 from __future__ import annotations
@@ -24,12 +18,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
+from backlash_ros.core.plant.numerics import Array
 
 SCALES = np.asarray(np.geomspace(3e-4, 10.0, 14), np.float64)  # of the error of G that are weighed
-
-# --- readings -----------------------------------------------------------------------------------
 
 
 class Likelihood(NamedTuple):
@@ -66,10 +57,7 @@ def likelihood(r: Array, noise_std: float, step: float) -> Likelihood:
 
 
 def _of_interval(r: Array, half: float) -> tuple[Array, Array, Array]:
-    """Log of the probability of a step of 2 half, its slope by the output, minus its curvature.
-
-    In units of the noise.
-    """
+    """Log of the probability of a step of 2 half [noise], its slope by the output, - curvature."""
     from scipy.special import log_ndtr  # where fits are made: 31 MB
 
     upper, lower = r + half, r - half
@@ -84,23 +72,18 @@ def _of_interval(r: Array, half: float) -> tuple[Array, Array, Array]:
 
 @lru_cache(maxsize=256)
 def mean_information(half: float) -> float:
-    """Fisher's information of a reading about the output, averaged over its step of 2 half.
-
-    In units of the noise.
-    """
+    """Fisher's information of a reading, averaged over its step of 2 half [noise]."""
     r = np.asarray(np.linspace(-half - 8.0, half + 8.0, 2001), np.float64)
     probability, score, _ = _of_interval(r, half)
     return float(score**2 @ np.exp(probability) * (r[1] - r[0]) / (2.0 * half))
 
 
 def independence(
-    y: Array, known: Flags, output: Array, step: float,
+    y: Array, known: NDArray[np.bool_], output: Array, step: float,
 ) -> tuple[Array, NDArray[np.intp]]:
-    """Share (N,) of an independent reading that each reading is; 0 where there is none.
+    """Share (N,) of an independent reading that each one is, and where these begin among the known.
 
-    Equal readings, one after the other, count as one while the output (N,), as the fit has it,
-    stays within a small part of the step. Also where each of these begins among those that are
-    known.
+    Equal readings, one after the other, repeat one rounding while the output (N,) stands still.
     """
     same_place = 16  # parts of a step within which an output counts as standing still
     weights = known.astype(np.float64)
@@ -108,14 +91,10 @@ def independence(
     if not step or not len(where):
         return weights, np.arange(len(where))
     places = np.floor(output[where] * (same_place / step))
-    changes = (np.diff(y[where]) != 0.0) | (np.diff(places) != 0.0)
-    begins = np.flatnonzero(np.append(True, changes))
+    begins = np.flatnonzero(np.append(True, (np.diff(y[where]) != 0.0) | (np.diff(places) != 0.0)))
     lengths = np.diff(np.append(begins, len(where)))
     weights[where] = np.repeat(1.0 / lengths, lengths)
     return weights, begins
-
-
-# --- a fit --------------------------------------------------------------------------------------
 
 
 class Prior(NamedTuple):
@@ -133,7 +112,7 @@ class Start(NamedTuple):
 
 
 class Left(NamedTuple):
-    """What a fit leaves: log-likelihood and rms of its residuals, and rho of them.
+    """What a fit leaves: log-likelihood and rms of its residuals, and correlation rho of them.
 
     readings: independent ones. turns: reversals of the engaged side in the record.
     """
@@ -147,7 +126,7 @@ class Left(NamedTuple):
 
 @dataclass(frozen=True)
 class WindowFit:
-    """Values of all unknowns with their posterior; compared, sent and printed like a number.
+    """Values of all unknowns with their posterior.
 
     x: state before the record. knots: of the walk (W,), and walk_std, 0 for none. p0: p before the
     record. theta: m, o, g, xi. noise_std: beside a step. step: of the readings where they are
@@ -170,17 +149,14 @@ class WindowFit:
 
     @property
     def m(self) -> float:
-        """Slope."""
         return float(self.theta[0])
 
     @property
     def gap(self) -> float:
-        """c_r - c_l."""
         return float(self.theta[2])
 
     @property
     def xi(self) -> list[float]:
-        """Error of G, K values."""
         out: list[float] = self.theta[3:].tolist()
         return out
 
@@ -191,12 +167,11 @@ class WindowFit:
 
     @property
     def inflation(self) -> float:
-        """Of the covariance, by the correlation of the residuals."""
+        """Of the covariance: N correlated residuals are N / (1 - rho + N rho) independent ones."""
         return 1.0 - self.left.correlation + self.left.readings * self.left.correlation
 
     @property
     def cov_xi(self) -> Array:
-        """Covariance of xi (K, K)."""
         return self.cov[3:, 3:] * self.inflation
 
     def behind(self, xi: Array) -> float:
@@ -204,14 +179,6 @@ class WindowFit:
         apart = self.theta[3:] - xi
         cov = self.cov_xi + 1e-16 * np.eye(len(apart))
         return 0.5 * float(apart @ np.linalg.solve(cov, apart))
-
-    def log_prior(self, older: Prior | None, leaks: int) -> float:
-        """Of theta, given what older samples say of it; leaks: how many of xi are leaks."""
-        scale, leak, xi = self.scale, self.theta[3:3 + leaks], self.theta[3 + leaks:]
-        squares = float(xi @ xi) / scale**2 + float(leak @ leak)
-        if older is not None:
-            squares += float(np.sum((older.rows @ self.theta - older.values) ** 2))
-        return -0.5 * (squares + log(scale) ** 2) - len(xi) * log(scale)
 
     @property
     def crossings(self) -> Array:
@@ -228,12 +195,10 @@ class WindowFit:
 
     @property
     def crossings_std(self) -> Array:
-        """Standard deviations of m, c_r, c_l, shape (3,)."""
         return np.asarray(np.sqrt(np.maximum(np.diag(self.crossings_cov), 0.0)))
 
     @property
     def gap_std(self) -> float:
-        """Standard deviation of the gap."""
         by = np.array([0.0, 1.0, -1.0])
         return sqrt(max(float(by @ self.crossings_cov @ by), 0.0))
 
@@ -272,12 +237,12 @@ def error_of_plant(
 
     r: triangle of xi (K + 1, K + 1). The variance is over that of f; with intervals it is 1.
     """
-    k = len(r) - 1
+    k, variance = len(r) - 1, 1.0 if f.step else squares / freedom
     if not k:
-        return np.zeros(0), np.zeros((0, 0)), f.scale, 0.0, 1.0 if f.step else squares / freedom
+        return np.zeros(0), np.zeros((0, 0)), f.scale, 0.0, variance
     u, singular, vt = np.linalg.svd(r[:k, :k])
     z, scales = u.T @ r[:k, k], SCALES[most_scale >= SCALES][:, None]
-    noise = np.full((len(scales), 1), 1.0 if f.step else squares / freedom)
+    noise = np.full((len(scales), 1), variance)
     for _ in range(1 if f.step else 4):  # noise and shrinkage depend on each other
         shrink = 1.0 / (1.0 + (scales * singular) ** 2 / noise)
         left = squares + (shrink * z**2).sum(axis=1, keepdims=True)

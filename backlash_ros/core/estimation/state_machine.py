@@ -47,8 +47,7 @@ from backlash_ros.core.estimation.explanations import (
     outliers,
     problem_of,
 )
-from backlash_ros.core.estimation.fit import FEW_STEPS, Problem
-from backlash_ros.core.estimation.noise import with_intervals, with_walk
+from backlash_ros.core.estimation.fit import FEW_STEPS, Problem, with_intervals, with_walk
 from backlash_ros.core.estimation.posterior import WindowFit
 from backlash_ros.core.estimation.score_tests import coasts, likelier
 from backlash_ros.core.estimation.settings import FEWEST, MISFIT, PREDICTED, SHORT_RECORD

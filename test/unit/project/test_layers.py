@@ -24,7 +24,7 @@ ROOMS = (
     'identification', 'driver_check',
 )
 ESTIMATION = (
-    'settings', 'plant_family', 'posterior', 'fit', 'search', 'noise', 'explanations',
+    'settings', 'plant_family', 'posterior', 'fit', 'search', 'explanations',
     'score_tests', 'belief', 'state_machine', 'observer', 'estimator',
 )
 NUMERIC = {'numpy', 'scipy'}
