@@ -25,8 +25,7 @@ from backlash_ros.core.estimation.posterior import Prior, Start, WindowFit
 from backlash_ros.core.estimation.search import search
 from backlash_ros.core.law import OutOfBounds
 from backlash_ros.core.plant.backlash import engaged, play, reversals
-
-Array = NDArray[np.float64]
+from backlash_ros.core.plant.numerics import Array
 
 
 @dataclass(frozen=True)
@@ -47,6 +46,10 @@ class Setup:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'noise_std', max(self.noise_std, 1e-12))
+
+    @property
+    def turns_needed(self) -> int:
+        return settings.REVERSALS if self.family.count else 1
 
 
 class Window(NamedTuple):
@@ -106,7 +109,7 @@ def afresh(
     like: G is about that of this fit. older: what is known beside the record. also: where to begin
     as well. walks: whether u may walk. A fit with m < 0 says that y goes the other way.
     """
-    family, swing = setup.family, float(np.ptp(record.v))
+    family, swing, first = setup.family, float(np.ptp(record.v)), float(record.v[0])
     if np.isfinite(record.y).sum() < 15 + 2 * family.count or not swing:
         return None
     p = problem_of(setup, record, older)
@@ -114,12 +117,11 @@ def afresh(
     noise = max(setup.noise_std, 0.05 * float(np.nanstd(record.y)))
     xi = np.zeros(family.count) if like is None else like.theta[3:]
     # Where v has not turned often enough for any gap, what is found is named, but not used.
-    hopeless = record.turns(0.01 * swing, float(record.v[0])) < _turns_needed(setup)
+    hopeless = record.turns(0.01 * swing, first) < setup.turns_needed
     candidates, apart = 1 if hopeless else 3, 0.1  # gaps that are fitted, and their distance
     fits: list[WindowFit] = []
     # Once more around G as the best of the first gaps has it.
-    again = family.count > 0 and like is None and not hopeless
-    for _ in range(1 + again):
+    for _ in range(2 if family.count and like is None and not hopeless else 1):
         found, null = search(family, record.v, record.y, setup.noise_std, setup.widest, xi)
         if not found or (not fits and found[0].evidence < null + settings.ENGAGED):
             break
@@ -128,21 +130,17 @@ def afresh(
             if len(gaps) < candidates and m * found[0].m > 0.0 and \
                     all(abs(gap - other) > apart * other for other in gaps):
                 gaps.append(gap)
-                theta = np.concatenate([[m, m * (p0 - record.v[0]), gap], xi])
-                start = p.step(
-                    WindowFit(np.zeros(1), p0, theta, noise, walk_std=setup.walk_std), 1.0,
-                    held=True, begun=True)
-                fits.append(p.finished(p.fitted(start, FIRST_STEPS)))
+                theta = np.concatenate([[m, m * (p0 - first), gap], xi])
+                begin = WindowFit(np.zeros(1), p0, theta, noise, walk_std=setup.walk_std)
+                fits.append(p.finished(p.fitted(
+                    p.step(begin, 1.0, held=True, begun=True), FIRST_STEPS)))
         xi = max(fits, key=lambda f: f.evidence).theta[3:]
-    if not fits:
-        return None
-    if also is not None and also.m > 0.0:
-        begins = replace(also.without_intervals, x=np.zeros(1), knots=np.zeros(0),
-                         walk_std=setup.walk_std)
-        fits.append(p.finished(p.fitted(begins, FIRST_STEPS)))
-    fits = sorted((f for f in fits if np.isfinite(f.evidence)), key=lambda f: -f.evidence)
+    if fits and also is not None and also.m > 0.0:
+        begin = replace(also.without_intervals, x=np.zeros(1), knots=np.zeros(0),
+                        walk_std=setup.walk_std)
+        fits.append(p.finished(p.fitted(begin, FIRST_STEPS)))
     different: list[WindowFit] = []
-    for f in fits:
+    for f in sorted((f for f in fits if np.isfinite(f.evidence)), key=lambda f: -f.evidence):
         if all(abs(f.gap - g.gap) >= 0.1 * sqrt(max(float(g.cov[2, 2]), 0.0)) for g in different):
             different.append(f)
     if not different:
@@ -152,8 +150,7 @@ def afresh(
     best = max(fits, key=lambda f: f.evidence)
     if best.m < 0.0 or hopeless:
         return best
-    best = with_intervals(p, best)
-    best = mixed(p, best, fits)
+    best = mixed(p, with_intervals(p, best), fits)
     return with_walk(p, best, setup.walk_std) if walks else best
 
 
@@ -170,9 +167,13 @@ def mixed(p: Problem, best: WindowFit, others: Sequence[WindowFit] = ()) -> Wind
         return mixed(p, likeliest, fits)
     share = np.exp([f.evidence - best.evidence for f in fits])
     for each, f in zip(share / max(float(share.sum()), 1e-300), fits, strict=True):
-        apart = f.crossings - best.crossings
-        wider += each * np.outer(apart, apart)
+        wider += each * _apart(f, best)
     return replace(best, spread=wider)
+
+
+def _apart(one: WindowFit, other: WindowFit) -> Array:
+    apart = one.crossings - other.crossings
+    return np.outer(apart, apart)
 
 
 def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]:
@@ -194,16 +195,13 @@ def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]
                 gap = best.gap + reach * std
                 if not 0.0 < gap < widest:
                     break
-                there = replace(
-                    best, p0=v + (best.p0 - v) * gap / best.gap,
-                    theta=best.theta + best.cov[:, 2] * reach / std,
-                )
+                there = replace(best, p0=v + (best.p0 - v) * gap / best.gap,
+                                theta=best.theta + best.cov[:, 2] * reach / std)
                 for _ in range(FEW_STEPS):
                     there = p.step(there, held=True)
                 behind = max(likeliest - p.log_posterior(there, weights), 1.0)
                 if nearer <= 2.0:
-                    apart = there.crossings - best.crossings
-                    wider = max(0.5 / behind - reach**-2, 0.0) * np.outer(apart, apart)
+                    wider = max(0.5 / behind - reach**-2, 0.0) * _apart(there, best)
                 if not there.m > 0.0:
                     break
                 beside = there if behind < 0.25 * reach**2 else None
@@ -225,39 +223,26 @@ def of_xi(f: WindowFit) -> Prior | None:
     return Prior(np.hstack([np.zeros((count, 3)), root]), root @ f.theta[3:])
 
 
-# --- judgement ----------------------------------------------------------------------------------
+def is_known(setup: Setup, f: WindowFit, turns: int | None = None) -> bool:
+    """Whether m and the gap are known well enough to be published, and within their bounds.
 
-
-def _turns_needed(setup: Setup) -> int:
-    return settings.REVERSALS if setup.family.count else 1
-
-
-def is_known(setup: Setup, f: WindowFit, turns: int) -> bool:
-    """Whether m and the gap are known well enough to be published.
-
-    turns: reversals of the engaged side that speak for it. While residuals are correlated the
-    deviations must be smaller: what causes that does not average out. A gap is also known where
-    its upper end is small beside the first guess: there is none.
+    turns: reversals of the engaged side that speak for it, None for those of its record.
     """
-    return _is_precise(setup, f, turns) and not outside_bounds(setup.bounds, f)
+    return is_precise(setup, f, turns) and not outside_bounds(setup.bounds, f)
 
 
-def forbidden(setup: Setup, f: WindowFit) -> OutOfBounds | None:
-    """What keeps a fit that would be known otherwise from being it; None for nothing."""
-    outside = outside_bounds(setup.bounds, f) if _is_precise(setup, f, f.left.turns) else []
-    return outside[0] if outside else None
-
-
-def _is_precise(setup: Setup, f: WindowFit, turns: int) -> bool:
-    if not f.valid or turns < _turns_needed(setup) or moves_unexplained(setup, f):
-        return False
-    return are_precise(setup, f.crossings, f.crossings_cov, f.systematic)
+def is_precise(setup: Setup, f: WindowFit, turns: int | None = None) -> bool:
+    """The same, whatever the bounds are."""
+    enough = (f.left.turns if turns is None else turns) >= setup.turns_needed
+    return f.valid and enough and not moves_unexplained(setup, f) and \
+        are_precise(setup, f.crossings, f.crossings_cov, f.systematic)
 
 
 def are_precise(setup: Setup, crossings: Array, cov: Array, systematic: bool) -> bool:
     """Whether m, c_r, c_l (3,) of this covariance (3, 3) are known well enough.
 
-    systematic: whether residuals are correlated.
+    systematic: whether residuals are correlated: what causes that does not average out. A gap is
+    also known where its upper end is small beside the first guess: there is none.
     """
     factor = 1.0 / settings.BY_CHANCE if systematic else 1.0
     m, c_r, c_l = map(float, crossings)

@@ -289,9 +289,9 @@ class Problem:
         furthest = float(np.abs(new.theta[3:] - f.theta[3:]).max(initial=0.0))
         length = share * min(longest / max(furthest, longest), 1.0)
         order, knots = max(len(f.x), len(new.x)), self._walk_of(f)[1]
-        x = padded(f.x, order)
+        old, x = padded(f.x, order), padded(new.x, order)
         return replace(
-            new, x=x + length * (padded(new.x, order) - x), knots=knots + length * (new.knots - knots),
+            new, x=old + length * (x - old), knots=knots + length * (new.knots - knots),
             p0=f.p0 + length * (new.p0 - f.p0), theta=f.theta + length * (new.theta - f.theta))
 
     def _noise_of(self, f: WindowFit) -> float:

@@ -1,16 +1,15 @@
-"""The linear plants that G(z) may be: G(z; xi), with exact gain at rest.
+"""The linear plants that G(z) may be, with exact gain at rest.
 
     G(z; xi) = z^-d [B (1 - f + f z^-1) + xi_w w (1 - z^-1)^2 B'] A(1)/A_nominal(1) / (A I)
 
-xi (K,) are the unknowns in units of their prior deviations: where G integrates, the leak of an
-integrator; the lag (d + f samples beside the nominal delay, d whole), the width of the response,
-and ln Omega, ln D of every section s^2 + 2 D Omega s + Omega^2 of two poles (a real pair is D >= 1,
-so that there is no edge), ln of a single real pole. The gain at rest stays in the slope m.
+xi (K,), in units of prior deviations: where G integrates, the leak of an integrator; the lag (d + f
+samples beside the nominal delay, d whole); the width of the response; ln Omega, ln D of every
+section s^2 + 2 D Omega s + Omega^2 of two poles (a real pair is D >= 1, so that there is no edge);
+ln of a single real pole. Poles at 0, on the negative axis or outside of the unit circle stay.
 
 What acts a part t of a sample late has the lag t and the width -t (1 - t) / 2: B' is B one sample
 shorter, and w = 1/8 the widest. With two poles, lag and width make every numerator that a dead time
-or another Omega can give. Poles at 0, on the negative axis or outside of the unit circle stay where
-they are.
+or another Omega can give.
 """
 
 from __future__ import annotations
@@ -24,10 +23,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from backlash_ros.core.plant.numerics import lfilter
+from backlash_ros.core.plant.numerics import Array, lfilter
 from backlash_ros.core.plant.transfer_function import ON_CIRCLE, TransferFunction, memory_of
-
-Array = NDArray[np.float64]
 
 
 class Family(Protocol):
@@ -43,10 +40,7 @@ class Family(Protocol):
     def leaks(self) -> int: ...
 
     def at(self, xi: list[float]) -> tuple[list[float], list[float]]:
-        """b and a of y(k) = sum b_i u(k-i) - sum a_i y(k-i), of one length.
-
-        y(k) is the output after the interval over which u(k) acted, so that b_0 is what acts with
-        the smallest delay there is.
+        """b and a of y(k) = sum b_i u(k-i) - sum a_i y(k-i), of one length; u(k) acts before y(k).
         """
 
     def slopes(self, xi: list[float]) -> tuple[Array, Array]:
@@ -62,8 +56,6 @@ class PlantFamily:
     """
 
     def __init__(self, model: TransferFunction, uncertainty: float) -> None:
-        widest = 0.125  # width of what acts half a sample late
-        of_leak = 5e-3  # prior deviation of the leak, per sample and unit of uncertainty
         b, poles = np.trim_zeros(model.numerator, 'f'), model.poles
         integrators = abs(poles - 1.0) < ON_CIRCLE
         elsewhere = ~integrators & (abs(poles) > ON_CIRCLE)
@@ -78,14 +70,12 @@ class PlantFamily:
         a = [x.real for x in self._stable(self._nominal)]
         self._gain, self._delay = sum(a), len(model.denominator) - len(b)
         late = max(self._delay + _mean(b) - _mean(np.array(a)), 1.0)
-        # Prior deviation and limit of what each xi moves: a leak of 0.1 a sample, a lag of 40
-        # samples, a factor of 20 on Omega and D.
-        self._scales: list[tuple[float, float]] = []
-        if uncertainty > 0.0:
-            self._scales = [
-                *[(of_leak * uncertainty, 0.1)] * self.integrates, (uncertainty * late, 40.0),
-                (widest, inf), *[(uncertainty, 3.0)] * len(self._nominal),
-            ]
+        # Prior deviation and limit of what each xi moves: a leak of up to 0.1 a sample, a lag of 40
+        # samples, the width of what acts half a sample late, a factor of 20 on Omega and D.
+        self._scales = [
+            *[(5e-3 * uncertainty, 0.1)] * self.integrates, (uncertainty * late, 40.0),
+            (0.125, inf), *[(uncertainty, 3.0)] * len(self._nominal),
+        ] if uncertainty > 0.0 else []
         # A leak says nothing of how wrong the rest of G is.
         self.count, self.leaks = len(self._scales), int(self.integrates and uncertainty > 0.0)
         shorter = np.poly1d([1.0, 1.0]) ** max(len(b) - 2, 0)
@@ -102,10 +92,8 @@ class PlantFamily:
     def slopes(self, xi: list[float]) -> tuple[Array, Array]:
         # By a complex step, exact to rounding: W. Squire, G. Trapp, SIAM Review 40 (1998) 110-112.
         h = 1e-30
-        rows = [
-            self._coefficients([x + 1j * h * (i == j) for i, x in enumerate(xi)])
-            for j in range(len(xi))
-        ]
+        rows = [self._coefficients([x + 1j * h * (i == j) for i, x in enumerate(xi)])
+                for j in range(len(xi))]
         shape = len(xi), 2, len(self.at(xi)[1])
         of_b, of_a = np.array(rows, complex).reshape(shape).imag.swapaxes(0, 1) / h
         return of_b, of_a
@@ -138,12 +126,9 @@ class PlantFamily:
         for omega, damping in ((exp(x), exp(y)) for x, y in pairs):
             r, square = exp(-omega * damping), omega * omega * (1.0 - damping * damping)
             a = _product(a, [1.0, -2.0 * r * cos(sqrt(square)), r * r])
-        for value in logs[2 * self._pairs:]:
-            a = _product(a, [1.0, -exp(-exp(value))])
-        return a
+        return _product(a, *([1.0, -exp(-exp(value))] for value in logs[2 * self._pairs:]))
 
     def model_at(self, xi: list[float]) -> TransferFunction:
-        """G(z; xi) as a transfer function."""
         b, a = (np.trim_zeros(np.array(x), 'b') for x in ([0.0, *self.at(xi)[0]], self.at(xi)[1]))
         length = max(len(b), len(a))
         return TransferFunction(padded(b, length).tolist(), padded(a, length).tolist())
@@ -158,9 +143,7 @@ class PlantFamily:
 
 def padded(x: Array, length: int) -> Array:
     """The first values of x, and zeros behind them, (length,)."""
-    out = np.zeros(length)
-    out[:len(x)] = x[:length]
-    return out
+    return np.append(x, np.zeros(max(length - len(x), 0)))[:length]
 
 
 def delayed(x: Array, count: int) -> Array:

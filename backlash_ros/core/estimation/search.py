@@ -1,8 +1,7 @@
 """Where to begin a fit: gaps and beginnings, by the evidence of all else in closed form.
 
 For a gap g and a beginning p0, y is linear in the state, o, m, m xi, and m times what p0 is off by
-(to first order in both): one QR for each of some 200 hypotheses. Rows are averaged to some 1,500,
-as densely as v moves.
+(to first order in both): one QR for each of some 200 hypotheses, over rows averaged to some 1,500.
 """
 
 from __future__ import annotations
@@ -16,9 +15,7 @@ from numpy.typing import NDArray
 from backlash_ros.core.estimation.plant_family import Family, sensitivities, state_columns
 from backlash_ros.core.estimation.settings import ROWS
 from backlash_ros.core.plant.backlash import play
-from backlash_ros.core.plant.numerics import lfilter
-
-Array = NDArray[np.float64]
+from backlash_ros.core.plant.numerics import Array, lfilter
 
 
 class Hypothesis(NamedTuple):
@@ -40,10 +37,10 @@ def search(
     G is linearized. smallest: gap that is compared, over the swing of v.
     """
     none = 1e-9  # gap that counts as none, over the swing of v
-    compared = _Comparison(family, v, y, noise_std, xi.tolist())
     swing = float(np.ptp(v))
     top = min(swing, widest)
     gaps: Array = np.append(none * swing, np.geomspace(smallest * min(swing, top), top, 32))
+    compared = _Comparison(family, v, y, noise_std, xi.tolist())
     # Of so many at once that memory holds them.
     parts = np.array_split(gaps, 1 + len(gaps) * len(v) * (1 + family.count) // 500_000)
     found = [h for part in parts for h in compared.evidence(part) if isfinite(h.evidence)]
@@ -60,8 +57,7 @@ class _Comparison:
         self, family: Family, v: Array, y: Array, noise_std: float, xi: list[float],
     ) -> None:
         self._family, self._v, self._xi, self._nominal = family, v, xi, noise_std
-        self._known = np.isfinite(y)
-        self._begins = _bins(v)
+        self._known, self._begins = np.isfinite(y), _bins(v)
         readings = np.add.reduceat(self._known.astype(np.float64), self._begins)
         self._weights = (readings > 0.0) / np.sqrt(np.maximum(readings, 1.0))
         b, a = family.at(xi)
@@ -101,7 +97,8 @@ class _Comparison:
             self._averaged(sensitivities(self._family, self._xi, move, y_over_a)),
         ], axis=1))
         y = np.broadcast_to(self._y, (len(g), 1, len(self._y)))
-        r = _triangles(np.concatenate([columns, y], axis=1).transpose(0, 2, 1))
+        stack = np.concatenate([columns, y], axis=1).transpose(0, 2, 1)
+        r = np.asarray(np.linalg.qr(stack, mode='r'))
         # In units of v.
         noise = np.sqrt((r[:, -1, -1] ** 2 + self._nominal**2) / self._freedom) \
             / (np.abs(r[:, 0, -1] / r[:, 0, 0]) + 1e-30)
@@ -110,7 +107,7 @@ class _Comparison:
             # p0 is anywhere within the gap.
             prior = np.column_stack([noise * 12.0**0.5 / g, *[noise / scale] * k])
             of_prior = prior[:, :, None] * np.eye(1 + k, 3 + k, 1)
-            s = _triangles(np.concatenate([r, of_prior], axis=1))
+            s = np.asarray(np.linalg.qr(np.concatenate([r, of_prior], axis=1), mode='r'))
             volume = np.log(prior / (np.abs(np.diagonal(s, 0, 1, 2)[:, 1:-1]) + 1e-300)).sum(axis=1)
             value = self._value(s[:, -1, -1] ** 2) + volume - 0.5 * scale**2
             evidence = np.maximum(evidence, value)
@@ -121,16 +118,8 @@ class _Comparison:
         return [Hypothesis(*one) for one in np.column_stack([evidence, g, p0, m])[best].tolist()]
 
 
-def _triangles(stacks: Array) -> Array:
-    """R of each matrix (H, n, p), shape (H, p, p)."""
-    return np.asarray(np.linalg.qr(stacks, mode='r'))
-
-
 def _bins(v: Array) -> NDArray[np.intp]:
-    """Where some 1,500 bins begin; every sample for short records.
-
-    Half of the bins are spread evenly over the time and half over the motion of v.
-    """
+    """Where some 1,500 bins begin, half of them even over time and half over the motion of v."""
     count = len(v)
     if count <= ROWS:
         return np.arange(count)
