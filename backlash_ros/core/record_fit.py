@@ -114,11 +114,11 @@ def _fitted(setup: explanations.Setup, v: Array, y: Array, bounds: Bounds | None
     if fit is None or not fit.valid:
         why = f'y shows nothing of v, which swung by {swing:.4g}'
         return RecordFit(family.model, family.model, (why,))
-    problem = explanations.problem_of(setup, record)
+    problem = setup.problem(record)
     wild = outliers(problem.residual(fit), setup.noise_std)
     if wild.any():
         record = record._replace(y=np.where(wild, nan, record.y))
-        problem = explanations.problem_of(setup, record)
+        problem = setup.problem(record)
         fit = explanations.afresh(setup, record, also=fit) or fit
     reversals = turns(np.append(fit.p0, problem.at(fit).p), 5.0 * fit.gap_std)
     wanted = settings.REVERSALS if family.count else 1
@@ -131,7 +131,7 @@ def _fitted(setup: explanations.Setup, v: Array, y: Array, bounds: Bounds | None
         f'the gap, about {fit.gap:.4g}, is known to {fit.gap_std:.2g} only':
             not fit.gap_std <= max(settings.STD_GAP * fit.gap, 0.01 * swing),
     }
-    outside = explanations.outside_bounds(bounds, fit) if bounds else ()
+    outside = setup.outside_bounds(fit) if bounds else ()
     off = family.count and fit.behind(np.zeros(family.count)) > 1.0
     return RecordFit(
         family.model, family.model_at(fit.xi) if off else family.model,

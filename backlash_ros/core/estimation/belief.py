@@ -2,31 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from enum import Enum, auto
 from math import inf, sqrt
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.estimation import settings
-from backlash_ros.core.estimation.explanations import (
-    Setup,
-    Window,
-    agree,
-    are_precise,
-    is_known,
-    moves_unexplained,
-    noisier,
-    problem_of,
-)
+from backlash_ros.core.estimation.explanations import Setup, Window
 from backlash_ros.core.estimation.fit import Problem
-from backlash_ros.core.estimation.posterior import Prior, Start, WindowFit
+from backlash_ros.core.estimation.posterior import Prior, Start, WindowFit, agree
 from backlash_ros.core.plant.backlash import Region, engaged, reversals
-
-Array = NDArray[np.float64]
+from backlash_ros.core.plant.numerics import Array
 
 
 class State(Enum):
@@ -72,24 +61,8 @@ class Trial(NamedTuple):
     predicted: int = 0
     noise: float = inf
 
-    @property
-    def lasts(self) -> bool:
-        """Whether the fit follows one that was contradicted and has not held for long."""
-        return self.predicted < settings.LASTING * self.must
 
-    @property
-    def next(self) -> Trial:
-        """That of what contradicts this fit.
-
-        Twice as long where it did not hold for long: what contradicts one explanation after the
-        other is no backlash.
-        """
-        longer = min(2 * self.must, settings.MOST_PREDICTED)
-        return self._replace(must=longer if self.lasts else settings.PREDICTED)
-
-
-@dataclass(frozen=True)
-class Belief:
+class Belief(NamedTuple):
     """What is believed after the samples before `end`; inherited: what was known before the run.
 
     found: newest fit that is not adopted. doubt_from: sample from which on the fit is contradicted.
@@ -102,9 +75,9 @@ class Belief:
     doubt_from: int | None = None
     end: int = 0
     next_at: int = settings.FIRST_FIT
-    thorough: Look = field(default_factory=Look)
-    kept: Kept = field(default_factory=Kept)
-    trial: Trial = field(default_factory=Trial)
+    thorough: Look = Look()
+    kept: Kept = Kept()
+    trial: Trial = Trial()
     published: Known | None = None
     inherited: Known | None = None
     reason: Status = Status.ACQUIRING
@@ -112,44 +85,30 @@ class Belief:
 
     @property
     def state(self) -> State:
-        """How the fit stands to the newest samples."""
         if self.fit is None:
             return State.SEARCHING
         return State.KNOWN if self.doubt_from is None else State.DOUBTED
-
-    @property
-    def newest(self) -> WindowFit | None:
-        """The fit, or that of no use where there is no other one."""
-        return self.fit or self.found
 
     @property
     def trusted(self) -> bool:
         """Whether the fit explains its samples and is known well enough."""
         return self.state is State.KNOWN and self.reason is not Status.INCONSISTENT
 
-    def problem(self, setup: Setup, record: Window) -> Problem:
-        """The fit of a record beside what is believed of the samples before it."""
-        return problem_of(setup, record, self.kept.older, self.kept.start)
 
-
-# --- what is published --------------------------------------------------------------------------
-
-
-def published(setup: Setup, belief: Belief) -> Belief:
-    """The same with what is published of the fit."""
-    fit = belief.fit
-    assert fit is not None
-    if belief.inherited is not None:
-        return _beside_inherited(setup, belief, fit, belief.inherited)
-    if not is_known(setup, fit, settings.REVERSALS):
-        return replace(belief, reason=Status.INCONSISTENT)
+def published(setup: Setup, belief: Belief, fit: WindowFit) -> Belief:
+    """This belief with that fit, and what is published of it."""
+    belief, known = belief._replace(fit=fit), belief.inherited
+    if known is not None:
+        return _beside_inherited(setup, belief, fit, known)
+    if not setup.is_known(fit, settings.REVERSALS):
+        return belief._replace(reason=Status.INCONSISTENT)
     if belief.trial.predicted < belief.trial.must:
         return belief
     cov = fit.crossings_cov + np.diag(setup.drift**2 * (belief.end - belief.kept.first) / 3.0)
     walked = (fit.walk_std / fit.m) ** 2 * (belief.next_at - belief.end)
     cov += walked * np.outer([0.0, 1.0, 1.0], [0.0, 1.0, 1.0])
-    return replace(
-        belief, published=Known(fit.crossings, cov), reason=Status.TRACKING, coasts=False)
+    return belief._replace(
+        published=Known(fit.crossings, cov), reason=Status.TRACKING, coasts=False)
 
 
 def _beside_inherited(setup: Setup, belief: Belief, fit: WindowFit, known: Known) -> Belief:
@@ -170,48 +129,41 @@ def _beside_inherited(setup: Setup, belief: Belief, fit: WindowFit, known: Known
     if not agree(fit.crossings, known.crossings, cov + prior):
         std = sqrt(fit.gap_std**2 + 2.0 * doubt)
         # A gear that is no play leaves systematic residuals, and denies nothing.
-        white = not fit.systematic and not noisier(setup, fit)
+        white = not fit.systematic and not setup.noisier(fit)
         sure = std < replacing * fit.gap and white and fit.left.turns >= settings.HELD_REVERSALS
         if sure and belief.trial.predicted >= belief.trial.must:
-            belief = replace(belief, inherited=None)  # it was that of another plant
-        return replace(belief, reason=Status.INCONSISTENT)
+            belief = belief._replace(inherited=None)  # it was that of another plant
+        return belief._replace(reason=Status.INCONSISTENT)
     gain = prior @ np.linalg.pinv(cov + prior)
     joined = Known(known.crossings + gain @ (fit.crossings - known.crossings), prior - gain @ prior)
     if belief.coasts or (not as_told and fit.systematic):
         joined = known  # what explains y no better is no reason to move
-    if not are_precise(setup, *joined, fit.systematic):
-        return replace(belief, reason=Status.ACQUIRING)
-    unexplained = moves_unexplained(setup, fit)
-    return replace(belief, published=joined,
+    if not setup.are_precise(*joined, fit.systematic):
+        return belief._replace(reason=Status.ACQUIRING)
+    unexplained = setup.moves_unexplained(fit)
+    return belief._replace(published=joined,
                    reason=Status.INCONSISTENT if unexplained else Status.TRACKING)
 
 
-# --- what older samples leave -------------------------------------------------------------------
+def shortened(
+    setup: Setup, record: Window, problem: Problem, belief: Belief, fit: WindowFit,
+) -> tuple[Belief, WindowFit]:
+    """Let the oldest samples go where the others hold enough reversals, or the backlash drifts.
 
-
-def excess(setup: Setup, record: Window, problem: Problem, fit: WindowFit) -> int:
-    """How many of the oldest samples may go: the others hold enough reversals.
-
-    Those over which the backlash drifts by more than it is known have to go as well.
+    What they say of theta stays, discounted as they were.
     """
-    count = len(record.v)
-    drift = setup.drift**2 * count / 3.0
-    drifts = count > 4 * settings.PREDICTED and (drift > np.diag(fit.crossings_cov)).any()
-    if drifts or count >= settings.LONGEST:
-        return count // 3
-    turns = reversals(engaged(record.v, problem.at(fit).p, fit.gap))
-    if count < settings.ROWS or len(turns) <= settings.HELD_REVERSALS:
-        return 0
-    cut = min(count // 3, int(turns[-settings.HELD_REVERSALS]) - 1)
-    return cut if cut >= count // 6 else 0
-
-
-def shortened(setup: Setup, record: Window, belief: Belief, cut: int) -> Belief:
-    """Let the oldest samples go; what they say of theta stays, discounted as they were."""
-    fit, kept = belief.fit, belief.kept
-    assert fit is not None
+    count, kept, p = len(record.v), belief.kept, problem.at(fit).p
+    turns, drift = reversals(engaged(record.v, p, fit.gap)), setup.drift**2 * count / 3.0
+    cut = 0
+    if count >= settings.LONGEST or (
+            count > 4 * settings.PREDICTED and (drift > np.diag(fit.crossings_cov)).any()):
+        cut = count // 3
+    elif count >= settings.ROWS and len(turns) > settings.HELD_REVERSALS:
+        cut = min(count // 3, int(turns[-settings.HELD_REVERSALS]) - 1)
+    if cut < count // 6:
+        return belief, fit
     rest = record.between(record.first + cut)
-    old = belief.problem(setup, record.between(record.first, rest.first))
+    old = setup.problem(record.between(record.first, rest.first), kept.older, kept.start)
     p = old.at(fit).p
     side, start = engaged(old.v, p, fit.gap)[-1], None
     if side != Region.GAP:
@@ -220,15 +172,13 @@ def shortened(setup: Setup, record: Window, belief: Belief, cut: int) -> Belief:
     begin = replace(fit, p0=float(p[-1]), x=np.zeros(len(fit.x)), knots=np.zeros(0))
     older = _aged(setup, fit, old.remembered(replace(fit, knots=begin.knots)), cut)
     for beside in ((older, start), (None, None)):
-        problem = problem_of(setup, rest, *beside)
+        problem = setup.problem(rest, *beside)
         shorter = problem.finished(problem.fitted(problem.begun(begin)))
         if shorter.left.rms < 2.0 * fit.left.rms:
             break
-    return replace(belief, fit=shorter, kept=Kept(
-        rest.first, *beside, *(
-            frozenset(k for k in numbers if k >= rest.first)
-            for numbers in (kept.rejected, kept.swapped)
-        )))
+    rejected, swapped = (frozenset(k for k in numbers if k >= rest.first)
+                         for numbers in (kept.rejected, kept.swapped))
+    return belief._replace(kept=Kept(rest.first, *beside, rejected, swapped)), shorter
 
 
 def _aged(setup: Setup, fit: WindowFit, prior: Prior, samples: int) -> Prior | None:

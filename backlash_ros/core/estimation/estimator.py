@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Bounds, Estimate, Status
 from backlash_ros.core.estimation.belief import Belief, Kept, Known
-from backlash_ros.core.estimation.explanations import Setup, Window, forbidden
+from backlash_ros.core.estimation.explanations import Setup, Window
 from backlash_ros.core.estimation.observer import Following, Gain, Place, gains_of, place_of
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.settings import FEWEST, FIRST_FIT, HELD_REVERSALS, LONGEST
@@ -67,7 +67,7 @@ def fitted(
     if fit is None or belief.published is None:
         return Fitted(belief)
     part = record.swapped(kept.swapped - swapped).between(kept.first, belief.end)
-    place = place_of(fit, belief.problem(setup, part), model, setup.family.memory)
+    place = place_of(fit, setup.problem(part, kept.older, kept.start), model, setup.family.memory)
     if not len(proposed) or not belief.trusted or fit.behind(proposed) <= 1.0:
         return Fitted(belief, place)
     better = setup.family.model_at(fit.xi)
@@ -148,7 +148,10 @@ class MovingHorizon(Law):
     @property
     def report(self) -> LawReport:
         belief, found = self._belief, self._belief.found
-        fit = belief.newest
+        fit = belief.fit or found
+        # What keeps a fit that would be known otherwise from being it.
+        precise = found is not None and self._setup.is_precise(found)
+        outside = self._setup.outside_bounds(found) if found is not None and precise else []
         return LawReport(
             noise_ratio=nan if belief.fit is None else belief.fit.noise / self._setup.noise_std,
             unexplained=nan if fit is None else fit.unexplained,
@@ -157,7 +160,7 @@ class MovingHorizon(Law):
             wrong_sign=found is not None and found.m < 0.0,
             undecided=belief.published is None and found is not None and found.m > 0.0
             and found.left.turns >= HELD_REVERSALS,
-            forbidden=None if found is None else forbidden(self._setup, found),
+            forbidden=outside[0] if outside else None,
             waiting=self._channel.record.end - belief.end,
             outliers=self._following.outliers,
             reattributed=self._reattributed,
@@ -248,7 +251,7 @@ class MovingHorizon(Law):
             return
         if isinstance(result, Failure):
             self._failed_fits += 1
-            self._belief = replace(self._belief, next_at=self._channel.record.end + FEWEST)
+            self._belief = self._belief._replace(next_at=self._channel.record.end + FEWEST)
             return
         before, belief, following = self._belief, result.belief, self._following
         self._belief, place, fit = belief, result.place, belief.fit
@@ -270,7 +273,7 @@ class MovingHorizon(Law):
     def _publish(self, known: Known) -> None:
         m, c_r, c_l = self._setup.bounds.project(*known.crossings.tolist())
         std_m, std_c_r, std_c_l = np.sqrt(np.maximum(np.diag(known.cov), 0.0)).tolist()
-        fit = self._belief.newest
+        fit = self._belief.fit or self._belief.found
         if self._belief.coasts and fit is not None:
             # Motion of the load within the gap makes the gap doubtful: a structure that shrinks it
             # by its deviations pushes the load less. A fit of its own may have next to no gap.

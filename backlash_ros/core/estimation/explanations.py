@@ -30,7 +30,7 @@ from backlash_ros.core.plant.numerics import Array
 
 @dataclass(frozen=True)
 class Setup:
-    """What is known before the first sample.
+    """What is known before the first sample, and what counts as known after some.
 
     noise_std: of y, nominal. widest: gap that is considered. guess: gap of the first guess.
     walk_std: of u, drift: of m, c_r, c_l (3,), both per square root of a sample.
@@ -47,9 +47,60 @@ class Setup:
     def __post_init__(self) -> None:
         object.__setattr__(self, 'noise_std', max(self.noise_std, 1e-12))
 
+    def problem(
+        self, record: Window, older: Prior | None = None, start: Start | None = None,
+    ) -> Problem:
+        return Problem(self.family, record.v, record.y, self.noise_std, older, start)
+
+    def is_known(self, f: WindowFit, turns: int | None = None) -> bool:
+        """Whether m and the gap are known well enough to be published, and within their bounds.
+
+        turns: reversals of the engaged side that speak for it, None for those of its record.
+        """
+        return self.is_precise(f, turns) and not self.outside_bounds(f)
+
+    def is_precise(self, f: WindowFit, turns: int | None = None) -> bool:
+        """The same, whatever the bounds are."""
+        enough = (f.left.turns if turns is None else turns) >= self.turns_needed
+        return f.valid and enough and not self.moves_unexplained(f) and \
+            self.are_precise(f.crossings, f.crossings_cov, f.systematic)
+
     @property
     def turns_needed(self) -> int:
         return settings.REVERSALS if self.family.count else 1
+
+    def are_precise(self, crossings: Array, cov: Array, systematic: bool) -> bool:
+        """Whether m, c_r, c_l (3,) of this covariance (3, 3) are known well enough.
+
+        systematic: whether residuals are correlated: what causes that does not average out. A gap
+        is also known where its upper end is small beside the first guess: there is none.
+        """
+        factor = 1.0 / settings.BY_CHANCE if systematic else 1.0
+        m, c_r, c_l = map(float, crossings)
+        std_m, *std = map(float, np.sqrt(np.maximum(np.diag(cov), 0.0)))
+        gap, gap_std = c_r - c_l, sqrt(max(float(cov[1, 1] + cov[2, 2] - 2.0 * cov[1, 2]), 0.0))
+        gap_known = max(gap_std, *std) < factor * settings.STD_GAP * gap
+        chance = settings.BY_CHANCE * gap_std
+        no_gap = gap < chance and gap + chance < settings.NEGLIGIBLE * self.guess
+        return std_m < factor * settings.STD_SLOPE * m and (gap_known or no_gap)
+
+    def moves_unexplained(self, f: WindowFit) -> bool:
+        """Whether y moves by more than is tolerated in a way that no G makes, if G is uncertain."""
+        return f.systematic and f.unexplained > settings.NEGLIGIBLE and self.family.count > 0
+
+    def noisier(self, f: WindowFit) -> bool:
+        """Whether readings are off by more than their nominal noise, or their step, makes them."""
+        return f.noise > settings.AS_GOOD * max(self.noise_std, f.step / sqrt(12.0))
+
+    def outside_bounds(self, f: WindowFit) -> list[OutOfBounds]:
+        """What of m, c_r, c_l lies outside of its bounds by more than chance."""
+        values = f.crossings
+        apart = np.abs(values - self.bounds.project(*values.tolist()))
+        outside = apart > settings.BY_CHANCE * f.crossings_std + 1e-9 * np.abs(values)
+        return [
+            OutOfBounds(name, float(value), getattr(self.bounds, name))
+            for name, value, out in zip(('m', 'c_r', 'c_l'), values, outside, strict=True) if out
+        ]
 
 
 class Window(NamedTuple):
@@ -93,13 +144,6 @@ class Window(NamedTuple):
         return len(reversals(engaged(self.v, play(self.v, gap, p0), gap)))
 
 
-def problem_of(
-    setup: Setup, record: Window, older: Prior | None = None, start: Start | None = None,
-) -> Problem:
-    """The fit of a record by this setup."""
-    return Problem(setup.family, record.v, record.y, setup.noise_std, older, start)
-
-
 def afresh(
     setup: Setup, record: Window, like: WindowFit | None = None, older: Prior | None = None,
     also: WindowFit | None = None, walks: bool = False,
@@ -112,7 +156,7 @@ def afresh(
     family, swing, first = setup.family, float(np.ptp(record.v)), float(record.v[0])
     if np.isfinite(record.y).sum() < 15 + 2 * family.count or not swing:
         return None
-    p = problem_of(setup, record, older)
+    p = setup.problem(record, older)
     # The noise of a first step is at least a twentieth of the motion of y.
     noise = max(setup.noise_std, 0.05 * float(np.nanstd(record.y)))
     xi = np.zeros(family.count) if like is None else like.theta[3:]
@@ -173,7 +217,7 @@ def mixed(p: Problem, best: WindowFit, others: Sequence[WindowFit] = ()) -> Wind
 
 def _apart(one: WindowFit, other: WindowFit) -> Array:
     apart = one.crossings - other.crossings
-    return np.outer(apart, apart)
+    return np.asarray(np.outer(apart, apart))
 
 
 def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]:
@@ -212,81 +256,6 @@ def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]
                 beyond.append(p.finished(p.fitted(beside)))
         out += 0.5 * wider
     return out, beyond
-
-
-def of_xi(f: WindowFit) -> Prior | None:
-    """What a fit knows of xi alone, as rows on theta."""
-    count = len(f.theta) - 3
-    if not count:
-        return None
-    root = np.linalg.inv(np.linalg.cholesky(f.cov_xi + 1e-12 * np.eye(count)))
-    return Prior(np.hstack([np.zeros((count, 3)), root]), root @ f.theta[3:])
-
-
-def is_known(setup: Setup, f: WindowFit, turns: int | None = None) -> bool:
-    """Whether m and the gap are known well enough to be published, and within their bounds.
-
-    turns: reversals of the engaged side that speak for it, None for those of its record.
-    """
-    return is_precise(setup, f, turns) and not outside_bounds(setup.bounds, f)
-
-
-def is_precise(setup: Setup, f: WindowFit, turns: int | None = None) -> bool:
-    """The same, whatever the bounds are."""
-    enough = (f.left.turns if turns is None else turns) >= setup.turns_needed
-    return f.valid and enough and not moves_unexplained(setup, f) and \
-        are_precise(setup, f.crossings, f.crossings_cov, f.systematic)
-
-
-def are_precise(setup: Setup, crossings: Array, cov: Array, systematic: bool) -> bool:
-    """Whether m, c_r, c_l (3,) of this covariance (3, 3) are known well enough.
-
-    systematic: whether residuals are correlated: what causes that does not average out. A gap is
-    also known where its upper end is small beside the first guess: there is none.
-    """
-    factor = 1.0 / settings.BY_CHANCE if systematic else 1.0
-    m, c_r, c_l = map(float, crossings)
-    std_m, *std = map(float, np.sqrt(np.maximum(np.diag(cov), 0.0)))
-    gap, gap_std = c_r - c_l, sqrt(max(float(cov[1, 1] + cov[2, 2] - 2.0 * cov[1, 2]), 0.0))
-    gap_known = max(gap_std, *std) < factor * settings.STD_GAP * gap
-    chance = settings.BY_CHANCE * gap_std
-    no_gap = gap < chance and gap + chance < settings.NEGLIGIBLE * setup.guess
-    return std_m < factor * settings.STD_SLOPE * m and (gap_known or no_gap)
-
-
-def moves_unexplained(setup: Setup, f: WindowFit) -> bool:
-    """Whether y moves by more than is tolerated in a way that no G makes, where G is uncertain."""
-    return f.systematic and f.unexplained > settings.NEGLIGIBLE and setup.family.count > 0
-
-
-def noisier(setup: Setup, f: WindowFit) -> bool:
-    """Whether readings are off by more than their configured noise, or their step, makes them."""
-    return f.noise > settings.AS_GOOD * max(setup.noise_std, f.step / sqrt(12.0))
-
-
-def outside_bounds(bounds: Bounds, f: WindowFit) -> list[OutOfBounds]:
-    """What of m, c_r, c_l lies outside of its bounds by more than chance."""
-    values = f.crossings
-    apart = np.abs(values - bounds.project(*values.tolist()))
-    outside = apart > settings.BY_CHANCE * f.crossings_std + 1e-9 * np.abs(values)
-    return [
-        OutOfBounds(name, float(value), getattr(bounds, name))
-        for name, value, out in zip(('m', 'c_r', 'c_l'), values, outside, strict=True) if out
-    ]
-
-
-def agree(one: Array, other: Array, cov: Array) -> bool:
-    """Whether two vectors (n,) differ by chance; cov: of their difference (n, n)."""
-    from scipy.special import chdtri  # where fits are made: 31 MB
-
-    apart = one - other
-    squares = float(apart @ np.linalg.lstsq(cov, apart, rcond=1e-14)[0])
-    return squares < float(chdtri(len(one), settings.CHANCE))
-
-
-def alike(one: WindowFit, other: WindowFit) -> bool:
-    """Whether the backlashes of two fits differ by chance."""
-    return agree(one.crossings, other.crossings, one.crossings_cov + other.crossings_cov)
 
 
 def outliers(z: Array) -> NDArray[np.bool_]:

@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from backlash_ros.core.estimation.settings import CHANCE
 from backlash_ros.core.plant.numerics import Array
 
 SCALES = np.asarray(np.geomspace(3e-4, 10.0, 14), np.float64)  # of the error of G that are weighed
@@ -174,6 +175,15 @@ class WindowFit:
     def cov_xi(self) -> Array:
         return self.cov[3:, 3:] * self.inflation
 
+    @property
+    def prior_of_xi(self) -> Prior | None:
+        """What it knows of xi alone."""
+        count = len(self.theta) - 3
+        if not count:
+            return None
+        root = np.linalg.inv(np.linalg.cholesky(self.cov_xi + 1e-12 * np.eye(count)))
+        return Prior(np.hstack([np.zeros((count, 3)), root]), root @ self.theta[3:])
+
     def behind(self, xi: Array) -> float:
         """Log-likelihood by which another error of G, xi (K,), is the worse one."""
         apart = self.theta[3:] - xi
@@ -192,6 +202,11 @@ class WindowFit:
         m, o, _ = self.theta[:3].tolist()
         by = np.array([[1.0, 0.0, 0.0], [-o / m**2, 1.0 / m, 0.0], [-o / m**2, 1.0 / m, -1.0]])
         return np.asarray(by @ self.cov[:3, :3] @ by.T * self.inflation + self.spread)
+
+    def alike(self, other: WindowFit) -> bool:
+        """Whether the backlashes of two fits differ by chance."""
+        cov = self.crossings_cov + other.crossings_cov
+        return agree(self.crossings, other.crossings, cov)
 
     @property
     def crossings_std(self) -> Array:
@@ -228,6 +243,15 @@ class WindowFit:
     def valid(self) -> bool:
         """Whether it is a backlash with finite deviations."""
         return self.m > 0.0 and self.cov.size > 0 and bool(np.isfinite(self.cov).all())
+
+
+def agree(one: Array, other: Array, cov: Array) -> bool:
+    """Whether two vectors (n,) differ by chance; cov: of their difference (n, n)."""
+    from scipy.special import chdtri  # where fits are made: 31 MB
+
+    apart = one - other
+    squares = float(apart @ np.linalg.lstsq(cov, apart, rcond=1e-14)[0])
+    return squares < float(chdtri(len(one), CHANCE))
 
 
 def error_of_plant(

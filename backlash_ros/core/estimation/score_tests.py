@@ -35,17 +35,24 @@ Array = NDArray[np.float64]
 
 
 def coasts(problem: Problem, fit: WindowFit, known: Array | None = None) -> bool:
-    """Whether the load runs on within the gap: that of the fit, or the one known before.
+    """Whether residuals are correlated because the load runs on within the gap.
 
-    known: m, c_r, c_l (3,). The fit of a load that coasts may have next to no gap.
+    That is the gap of the fit, or the one `known` before: m, c_r, c_l (3,). The fit of a load that
+    coasts may have next to no gap.
     """
+    if not (fit.m > 0.0 and fit.systematic):
+        return False
     if known is not None:
         m, c_r, c_l = known.tolist()
         theta = np.concatenate([[m, m * c_r, c_r - c_l], fit.theta[3:]])
-        there = problem.begun(replace(
-            fit, theta=theta, p0=float(problem.v[0]) + 0.5 * (c_r - c_l)))
-        if coasts(problem, problem.finished(there)):
+        p0 = float(problem.v[0]) + 0.5 * (c_r - c_l)
+        there = problem.begun(replace(fit, theta=theta, p0=p0))
+        if _runs_on(problem, problem.finished(there)):
             return True
+    return _runs_on(problem, fit)
+
+
+def _runs_on(problem: Problem, fit: WindowFit) -> bool:
     v, p = problem.v, problem.at(fit).p
     beyond = [0.0]  # how far a load that nothing brakes is from p
     speed = 0.0

@@ -1,58 +1,36 @@
 """From a record and what was believed before to what is believed now: a pure function.
 
-| state     | meaning                     | published            | left for, when              |
-|-----------|-----------------------------|----------------------|-----------------------------|
-| SEARCHING | no fit explains the record  | first guess, or what | KNOWN: a fit is known well  |
-|           |                             | was known before     | enough, twice in a row      |
-| KNOWN     | the fit explains all        | the fit              | DOUBTED: newer samples      |
-|           | samples                     |                      | contradict it               |
-| DOUBTED   | newer samples contradict    | the fit before them  | KNOWN: it predicts samples  |
-|           | the fit                     |                      | again, or another backlash  |
-|           |                             |                      | explains the newer ones;    |
-|           |                             |                      | SEARCHING: nothing does for |
-|           |                             |                      | as long as a search looks   |
-
-What was known before the run is joined with what the samples say as long as they agree; where they
-contradict it, and are precise on their own, it is dropped.
+| state     | meaning                    | published            | left for, when                  |
+|-----------|----------------------------|----------------------|---------------------------------|
+| SEARCHING | no fit explains the record | first guess, or what | KNOWN: a fit is known well      |
+|           |                            | was known before     | enough, twice in a row          |
+| KNOWN     | the fit explains all       | the fit              | DOUBTED: newer samples          |
+|           | samples                    |                      | contradict it                   |
+| DOUBTED   | newer samples contradict   | the fit before them  | KNOWN: it predicts again, or    |
+|           | the fit                    |                      | another backlash does;          |
+|           |                            |                      | SEARCHING: nothing does for as  |
+|           |                            |                      | long as a search looks          |
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
-from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.estimation import settings
 from backlash_ros.core.estimation.belief import (
     Belief,
-    Kept,
     Look,
     State,
     Trial,
-    excess,
     published,
     shortened,
 )
-from backlash_ros.core.estimation.explanations import (
-    Setup,
-    Window,
-    afresh,
-    alike,
-    is_known,
-    mixed,
-    noisier,
-    of_xi,
-    outliers,
-    problem_of,
-)
+from backlash_ros.core.estimation.explanations import Setup, Window, afresh, mixed, outliers
 from backlash_ros.core.estimation.fit import FEW_STEPS, Problem, with_intervals, with_walk
 from backlash_ros.core.estimation.posterior import WindowFit
 from backlash_ros.core.estimation.score_tests import coasts, likelier
-from backlash_ros.core.estimation.settings import FEWEST, MISFIT, PREDICTED, SHORT_RECORD
-
-Array = NDArray[np.float64]
+from backlash_ros.core.estimation.settings import BLOCKS, FEWEST, MISFIT, PREDICTED, SHORT_RECORD
 
 
 def learn(setup: Setup, record: Window, before: Belief) -> Belief:
@@ -71,24 +49,21 @@ def learn(setup: Setup, record: Window, before: Belief) -> Belief:
 
 def _begun_anew(before: Belief, first: int, end: int, next_at: int) -> Belief:
     """Nothing is known of the samples; what was published stays."""
-    return replace(
-        before, reason=before.reason if before.fit is None else Status.INCONSISTENT, fit=None,
+    return before._replace(
+        reason=before.reason if before.fit is None else Status.INCONSISTENT, fit=None,
         found=None, doubt_from=None, end=end, next_at=next_at,
         kept=before.kept._replace(first=first, older=None, start=None),
     )
 
 
-# --- SEARCHING --------------------------------------------------------------------------------
-
-
 def _searching(setup: Setup, record: Window, before: Belief) -> Belief:
     shortest = 50  # samples of a part of a record that is searched alone
     count, tried = len(record.v), before.found
-    soon = record.end + max(count // settings.BLOCKS, FEWEST)
-    known_once = tried is not None and is_known(setup, tried, tried.left.turns)
+    soon = record.end + max(count // BLOCKS, FEWEST)
+    known_once = tried is not None and setup.is_known(tried)
     if tried is not None and not known_once and record.end < before.thorough.at \
-            and not is_known(setup, tried, record.turns(max(tried.gap, 0.0), tried.p0)):
-        return replace(before, end=record.end, next_at=soon)
+            and not setup.is_known(tried, record.turns(max(tried.gap, 0.0), tried.p0)):
+        return before._replace(end=record.end, next_at=soon)
     # What many reversals do not tell, a few more will not.
     lasting = tried is not None and tried.left.turns >= settings.HELD_REVERSALS
     growth = 2.0 if lasting else settings.GROWTH
@@ -100,32 +75,31 @@ def _searching(setup: Setup, record: Window, before: Belief) -> Belief:
         # What happened at its beginning may have spoilt a record.
         shorter = shorter.between(shorter.end - len(shorter.v) // 3)
         newest = afresh(setup, shorter)
-        if newest is not None and is_known(setup, newest, newest.left.turns):
+        if newest is not None and setup.is_known(newest):
             found, part = newest, shorter
             break
-    after = replace(before, end=record.end, next_at=search_at, thorough=Look(search_at),
+    after = before._replace(end=record.end, next_at=search_at, thorough=Look(search_at),
                     found=None, reason=why, coasts=False)
     if found is None:
         return after
     part, found, swapped = _with_commands(setup, part, found, before.kept.swapped)
-    runs_on = _runs_on(
-        problem_of(setup, part), found, before.published and before.published.crossings)
-    after = replace(
-        after, kept=before.kept._replace(swapped=swapped), found=found, coasts=runs_on,
+    known = before.published and before.published.crossings
+    runs_on = coasts(setup.problem(part), found, known)
+    after = after._replace(
+        kept=before.kept._replace(swapped=swapped), found=found, coasts=runs_on,
         reason=Status.INCONSISTENT if runs_on else why,
     )
-    if not is_known(setup, found, found.left.turns):
+    if not setup.is_known(found):
         # But for a reversal, which may come soon?
-        return replace(after, next_at=soon) if is_known(setup, found, settings.REVERSALS) else after
-    if tried is None or not known_once or not alike(tried, found):
+        return after._replace(next_at=soon) if setup.is_known(found, settings.REVERSALS) else after
+    if tried is None or not known_once or not tried.alike(found):
         # A first estimate has to be found twice: some samples alone may mislead.
-        return replace(after, next_at=soon)
+        return after._replace(next_at=soon)
     # What leaves more than noise must predict a quarter as many samples before it is believed.
-    more = found.systematic or noisier(setup, found)
-    must = max(before.trial.must, len(part.v) // 4 if more else 0)
-    return _adopted(setup, part, found, replace(
-        after, kept=after.kept._replace(older=None, start=None),
-        trial=before.trial._replace(must=must)))
+    more = found.systematic or setup.noisier(found)
+    trial = before.trial._replace(must=max(before.trial.must, len(part.v) // 4 if more else 0))
+    kept = after.kept._replace(older=None, start=None)
+    return _adopted(setup, part, found, after._replace(kept=kept, trial=trial))
 
 
 def _with_commands(
@@ -138,113 +112,97 @@ def _with_commands(
     sent = record, found, swapped
     for _ in range(4 if np.isfinite(record.other).any() else 0):
         before = swapped
-        record, swapped = likelier(problem_of(setup, record), found, record, record.first, before)
+        record, swapped = likelier(setup.problem(record), found, record, record.first, before)
         if swapped == before:
             break
         found = afresh(setup, record, also=found) or found
-    return sent if _leaves_more(setup, found) else (record, found, swapped)
+    return sent if found.systematic and setup.noisier(found) else (record, found, swapped)
 
 
 def _why(setup: Setup, found: WindowFit | None, record: Window, before: Belief) -> Status:
     """What to say while nothing is known."""
+    known = before.published
     if len(record.v) < 100 and before.reason is Status.ACQUIRING:
         return Status.ACQUIRING
     if found is None:
-        known = before.published
         crosses = known and np.ptp(record.v) > known.crossings[1] - known.crossings[2]
         return Status.INCONSISTENT if crosses else Status.NOT_EXCITED
     # Until v has swung past the gap a fit may have none: the gap of the first guess counts then.
     gap = max(found.gap, setup.guess)
     large = found.unexplained * found.gap > settings.NEGLIGIBLE * gap \
         or record.turns(gap, float(record.v[0])) >= settings.HELD_REVERSALS
-    wrong = found.m < 0.0 or (large and _leaves_more(setup, found))
-    contradicts = before.published and is_known(setup, found, found.left.turns)
-    return Status.INCONSISTENT if wrong or contradicts else Status.ACQUIRING
-
-
-def _runs_on(problem: Problem, fit: WindowFit, known: Array | None = None) -> bool:
-    """Whether a load that coasts is what residuals are correlated by."""
-    return fit.m > 0.0 and fit.systematic and coasts(problem, fit, known)
-
-
-def _leaves_more(setup: Setup, found: WindowFit) -> bool:
-    """Whether a fit leaves more than noise, and correlated."""
-    return found.systematic and noisier(setup, found)
+    wrong = found.m < 0.0 or (large and found.systematic and setup.noisier(found))
+    return Status.INCONSISTENT if wrong or (known and setup.is_known(found)) else Status.ACQUIRING
 
 
 def _adopted(setup: Setup, record: Window, fit: WindowFit, before: Belief) -> Belief:
     """The fit of this record is what is believed."""
-    count, must = len(record.v), before.trial.must
+    count, must, kept = len(record.v), before.trial.must, before.kept
     another_noise = before.published is None or fit.walk_std > 0.0
-    if before.fit is not None and another_noise and alike(fit, before.fit):
+    if before.fit is not None and another_noise and fit.alike(before.fit):
         must = min(must, PREDICTED)  # another noise, or a walk, but not another backlash
-    return published(setup, replace(
-        before, fit=fit, found=None, doubt_from=None, end=record.end,
-        coasts=_runs_on(before.problem(setup, record), fit),
-        kept=before.kept._replace(first=record.first), trial=Trial(must, 0, fit.noise),
-        next_at=record.end + max(count // settings.BLOCKS, FEWEST),
+    return published(setup, before._replace(
+        found=None, doubt_from=None, end=record.end,
+        coasts=coasts(setup.problem(record, kept.older, kept.start), fit),
+        kept=kept._replace(first=record.first), trial=Trial(must, 0, fit.noise),
+        next_at=record.end + max(count // BLOCKS, FEWEST),
         thorough=Look(record.end + count // 4, 0.5 * fit.gap_std),
-    ))
-
-
-# --- KNOWN ------------------------------------------------------------------------------------
+    ), fit)
 
 
 def _known(setup: Setup, record: Window, before: Belief) -> Belief:
     held, trial, kept = before.fit, before.trial, before.kept
     assert held is not None
     count, new = len(record.v), before.end - record.first
-    problem = before.problem(setup, record)
+    problem = setup.problem(record, kept.older, kept.start)
     fit = problem.fitted(held, FEW_STEPS)
     since = before.end - setup.family.memory
     record, others = likelier(problem, fit, record, since, kept.swapped)
     if others != kept.swapped:
         kept = kept._replace(swapped=others)
-        problem = before.problem(setup, record)
+        problem = setup.problem(record, kept.older, kept.start)
         fit = problem.fitted(fit, FEW_STEPS)
     wild = outliers(problem.residual(fit)[new:] / held.noise)
     if wild.any():
         numbers = frozenset((record.first + new + np.flatnonzero(wild)).tolist())
-        cleaned = replace(before, kept=kept._replace(rejected=kept.rejected | numbers))
+        cleaned = before._replace(kept=kept._replace(rejected=kept.rejected | numbers))
         return _known(setup, record.without(numbers), cleaned)
     # What was known before the run is not to be moved by samples that the fit does not explain.
     rho = held.left.correlation if before.inherited is None else 0.0
     if _contradicts(problem, held, fit, new, rho):
         fit = problem.fitted(held)  # before anything is blamed
-    grown = trial.lasts and fit.noise > settings.AS_GOOD * trial.noise
+    lately = trial.predicted < settings.LASTING * trial.must  # it replaced one that did not last
+    grown = lately and fit.noise > settings.AS_GOOD * trial.noise
     if grown or _contradicts(problem, held, fit, new, rho):
         beyond = np.nan_to_num((problem.residual(held)[new:] / held.noise) ** 2 - MISFIT)
         change = int(np.argmax(np.cumsum(beyond[::-1])[::-1]))
-        return replace(
-            before, end=record.end, found=None, kept=kept, trial=trial.next,
+        # What contradicts one explanation after the other is no backlash.
+        must = min(2 * trial.must, settings.MOST_PREDICTED) if lately else PREDICTED
+        return before._replace(
+            end=record.end, found=None, kept=kept, trial=trial._replace(must=must),
             doubt_from=record.first + new + change, next_at=record.end + FEWEST,
-            reason=Status.INCONSISTENT if trial.lasts else before.reason,
+            reason=Status.INCONSISTENT if lately else before.reason,
         )
-    after = replace(
-        before, end=record.end, next_at=record.end + max(count // settings.BLOCKS, FEWEST),
+    after = before._replace(
+        end=record.end, next_at=record.end + max(count // BLOCKS, FEWEST),
         kept=kept, trial=trial._replace(predicted=trial.predicted + count - new),
     )
     narrow = fit.gap_std < before.thorough.gap_std and count <= SHORT_RECORD
     if narrow or record.end >= before.thorough.at:
-        fit = with_intervals(problem, fit)
+        fit, other = with_intervals(problem, fit), None
         short = count <= SHORT_RECORD and kept.start is None
-        other = None
         if short:
             other = afresh(setup, record, None if kept.older is None else fit, kept.older)
-            if other is not None and not is_known(setup, other, settings.REVERSALS):
-                other = None
         if short or fit.spread.any():  # else it has been normal for long
-            fit = mixed(problem, fit, () if other is None else (other,))
+            known = other is not None and setup.is_known(other, settings.REVERSALS)
+            fit = mixed(problem, fit, [other] if other is not None and known else [])
         fit = with_walk(problem, fit, setup.walk_std)
-        after = replace(
-            after, thorough=Look(record.end + 2 * count // 5, 0.5 * fit.gap_std))
+        after = after._replace(
+            thorough=Look(record.end + 2 * count // 5, 0.5 * fit.gap_std))
     else:
         fit = problem.finished(fit)
-    after = replace(after, fit=fit, coasts=_runs_on(problem, fit))
-    cut = excess(setup, record, problem, fit)
-    if cut:
-        return published(setup, shortened(setup, record, after, cut))
-    return published(setup, after)
+    after = after._replace(coasts=coasts(problem, fit))
+    return published(setup, *shortened(setup, record, problem, after, fit))
 
 
 def _contradicts(
@@ -275,27 +233,24 @@ def _most(least: float, count: float, rho: float) -> float:
     return max(least, float(chdtri(free, 1e-5)) / free)
 
 
-# --- DOUBTED ----------------------------------------------------------------------------------
-
-
 def _doubted(setup: Setup, record: Window, before: Belief) -> Belief:
     """The samples since the doubt: over, another backlash, or nothing that explains them."""
     held, since, kept = before.fit, before.doubt_from, before.kept
     assert held is not None
     assert since is not None
     count, newer = len(record.v), record.end - since
-    after = replace(before, end=record.end, found=None,
+    after = before._replace(end=record.end, found=None,
                     next_at=record.end + max(newer // 4, FEWEST))
-    z = before.problem(setup, record).residual(held) / held.noise
+    z = setup.problem(record, kept.older, kept.start).residual(held) / held.noise
     if newer >= 2 * PREDICTED and np.nanmean(z[-PREDICTED:] ** 2) < MISFIT:
         # Whatever it was, it is over: what was measured meanwhile says nothing.
         lost = frozenset(range(since, record.end - PREDICTED))
-        return replace(
-            after, doubt_from=None, kept=kept._replace(rejected=kept.rejected | lost),
+        return after._replace(
+            doubt_from=None, kept=kept._replace(rejected=kept.rejected | lost),
             end=record.end - 1, next_at=record.end,
         )
     if newer >= PREDICTED:
-        after = replace(after, reason=Status.INCONSISTENT)
+        after = after._replace(reason=Status.INCONSISTENT)
     short = max(SHORT_RECORD, 4 * setup.family.memory)
     explained = settings.AS_GOOD * held.noise
     whole = None
@@ -305,20 +260,20 @@ def _doubted(setup: Setup, record: Window, before: Belief) -> Belief:
             whole = None
     for first in (since, (since + record.end) // 2):
         part = record.between(first)
-        found = afresh(setup, part, held, of_xi(held)) if len(part.v) >= PREDICTED else None
+        found = afresh(setup, part, held, held.prior_of_xi) if len(part.v) >= PREDICTED else None
         if found is None or found.left.rms > explained \
-                or not is_known(setup, found, found.left.turns + (setup.family.count > 0)):
+                or not setup.is_known(found, found.left.turns + (setup.family.count > 0)):
             continue
         apart = held.evidence + found.evidence - 0.5 * (4 + len(held.x)) * np.log(len(part.v))
         if whole is not None and whole.evidence > apart:
             break
-        if before.found is None or not alike(before.found, found):
-            return replace(after, found=found)
-        return _adopted(setup, part, found, replace(
-            after, kept=Kept(0, of_xi(held), None, kept.rejected, kept.swapped)))
-    if whole is not None and is_known(setup, whole, whole.left.turns):
-        return _adopted(setup, record, whole, replace(
-            after, kept=kept._replace(older=None, start=None)))
+        if before.found is None or not before.found.alike(found):
+            return after._replace(found=found)
+        return _adopted(setup, part, found, after._replace(kept=kept._replace(
+            first=0, older=held.prior_of_xi, start=None)))
+    if whole is not None and setup.is_known(whole):
+        return _adopted(setup, record, whole, after._replace(
+            kept=kept._replace(older=None, start=None)))
     # Two reversals of the record take so long, on average.
     if newer > max(short, 2 * count // max(held.left.turns, 1)):
         return _begun_anew(after, since, record.end, record.end + 1)
