@@ -2,10 +2,7 @@
 
 Moving-horizon estimation of the gap, the slope, the crossings, the error of G, the noise and the
 state of G at once (C. V. Rao, J. B. Rawlings, D. Q. Mayne, Constrained state estimation for
-nonlinear discrete-time systems, IEEE Trans. Automatic Control 48 (2003) 246-258). `update` takes
-in a sample: play operator and observer advance (observer.py). `refine` has the newest record
-fitted where that is due (state_machine.py), in a worker process or at once, and goes on from its
-result, whichever sample that belongs to. docs/estimation.md explains the method and measures it.
+nonlinear discrete-time systems, IEEE Trans. Automatic Control 48 (2003) 246-258).
 """
 
 from __future__ import annotations
@@ -20,28 +17,29 @@ from numpy.typing import NDArray
 from backlash_ros.core.estimate import Bounds, Estimate, Status
 from backlash_ros.core.estimation.belief import Belief, Kept, Known
 from backlash_ros.core.estimation.explanations import Setup, Window
-from backlash_ros.core.estimation.observer import Following, Gain, Place, gains_of, place_of
+from backlash_ros.core.estimation.observer import Following, Place, state_after
 from backlash_ros.core.estimation.plant_family import PlantFamily
-from backlash_ros.core.estimation.settings import FEWEST, FIRST_FIT, HELD_REVERSALS, LONGEST
+from backlash_ros.core.estimation.settings import (
+    FEWEST,
+    FIRST_FIT,
+    HELD_REVERSALS,
+    LONGEST,
+    ROWS,
+)
 from backlash_ros.core.estimation.state_machine import learn
 from backlash_ros.core.jobs import ChannelSamples, Executor, Failure
 from backlash_ros.core.law import Interval, Law, LawReport
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.plant.numerics import Array
 from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
-
-Array = NDArray[np.float64]
 
 
 class Proposal(NamedTuple):
-    """A G that was learned, its xi (K,), and the gains of its observer.
-
-    xi is () where G was identified together with the backlash: it is not to be learned again.
-    """
+    """A G that was learned, and its xi (K,): () where it is not to be learned again."""
 
     model: StateModel
     xi: Array
-    gains: tuple[Gain, ...] | None
 
 
 class Fitted(NamedTuple):
@@ -67,22 +65,24 @@ def fitted(
     if fit is None or belief.published is None:
         return Fitted(belief)
     part = record.swapped(kept.swapped - swapped).between(kept.first, belief.end)
-    place = place_of(fit, setup.problem(part, kept.older, kept.start), model, setup.family.memory)
+    run = setup.problem(part, kept.older, kept.start).at(fit)
+    newest = slice(-min(len(part.v), 4 * setup.family.memory, ROWS), None)
+    u, y = run.u[newest], part.y[newest]
+    place = Place(float(run.p[-1]), u, y, model, state_after(model, u, y))
     if not len(proposed) or not belief.trusted or fit.behind(proposed) <= 1.0:
         return Fitted(belief, place)
-    better = setup.family.model_at(fit.xi)
     return Fitted(
-        belief, place, Proposal(StateModel(better), fit.theta[3:], gains_of(better)))
+        belief, place, Proposal(StateModel(setup.family.model_at(fit.xi)), fit.theta[3:]))
 
 
 class MovingHorizon(Law):
     """Learns (m, c_r, c_l) and the error of G from y alone.
 
-    initial: a first guess, or with its deviations what was learned before. model: the nominal G.
-    uncertainty: relative spread of its time constants, damping and delay, 0 where it is exact.
-    noise_std: of y, a first guess. walk_std, drift_std: random walks of u and of m, c_r, c_l, per
-    square root of a second; a walk_std of 0 is learned where the samples demand a walk. observer:
-    gives the state of G until the backlash is known, for structures that want it.
+    initial: a first guess, or with its deviations what was learned before. uncertainty: relative
+    spread of the time constants, damping and delay of the nominal G, 0 where it is exact. walk_std,
+    drift_std: random walks of u and of m, c_r, c_l, per square root of a second; a walk_std of 0 is
+    learned where the samples demand a walk. observer: gives the state of G until the backlash is
+    known, for structures that want it.
     """
 
     RETUNED = (
@@ -108,17 +108,11 @@ class MovingHorizon(Law):
             known = Known(np.array([initial.m, initial.c_r, initial.c_l]), np.diag(std**2))
             self._belief = Belief(inherited=known, published=known)
         self._following = Following(model, observer)
-        self._proposal = Proposal(model, np.zeros(0 if initial.learned else family.count), None)
-        self._adapting, self._lost_in_a_row, self._failed_fits = True, 0, 0
+        self._proposal = Proposal(model, np.zeros(0 if initial.learned else family.count))
+        self._recording = True  # whether the newest sample was one to learn from
+        self._lost_in_a_row = self._failed_fits = 0
         self._reattributed = 0  # intervals so far over which the other command acted
         self._skipping_fit = False  # whether the fit under way is of a record that was given up
-
-    # --- what it says ----------------------------------------------------------------------------
-
-    @property
-    def model(self) -> StateModel:
-        """The G that x_hat is the state of."""
-        return self._following.model
 
     @property
     def u_hat(self) -> float:
@@ -139,7 +133,8 @@ class MovingHorizon(Law):
 
     @property
     def proposal(self) -> StateModel | None:
-        return None if self._proposal.model is self.model else self._proposal.model
+        proposed = self._proposal.model
+        return None if proposed is self._following.model else proposed
 
     @property
     def learned_model(self) -> StateModel:
@@ -147,13 +142,12 @@ class MovingHorizon(Law):
 
     @property
     def report(self) -> LawReport:
-        belief, found = self._belief, self._belief.found
+        belief, found, setup = self._belief, self._belief.found, self._setup
         fit = belief.fit or found
-        # What keeps a fit that would be known otherwise from being it.
-        precise = found is not None and self._setup.is_precise(found)
-        outside = self._setup.outside_bounds(found) if found is not None and precise else []
+        precise = found is not None and setup.is_precise(found)
+        outside = setup.outside_bounds(found) if found is not None and precise else []
         return LawReport(
-            noise_ratio=nan if belief.fit is None else belief.fit.noise / self._setup.noise_std,
+            noise_ratio=nan if belief.fit is None else belief.fit.noise / setup.noise_std,
             unexplained=nan if fit is None else fit.unexplained,
             unconfirmed=belief.inherited is not None and belief.fit is None,
             coasts=belief.coasts,
@@ -175,29 +169,8 @@ class MovingHorizon(Law):
         variance = np.einsum('ij,jk,ik->i', slopes, fit.cov_xi, slopes.conj()).real
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
-    # --- what it is told -------------------------------------------------------------------------
-
-    @property
-    def adapting(self) -> bool:
-        """Whether it learns; otherwise it goes on following the state of G alone."""
-        return self._adapting
-
-    @adapting.setter
-    def adapting(self, adapting: bool) -> None:
-        if adapting and not self._adapting:
-            # Another record: the samples before it are not those before the next one.
-            before, end = self._belief, self._channel.record.end
-            self._belief = Belief(
-                kept=Kept(first=end), end=end, next_at=end + FIRST_FIT, published=before.published,
-                inherited=before.inherited or before.published,
-            )
-            self._skipping_fit = self._channel.busy
-        self._adapting = adapting
-
     def adopt(self, model: StateModel) -> None:
-        proposal = self._proposal
-        gains = proposal.gains if proposal.model is model else None
-        self._following.change_model(model, gains)
+        self._following.change_model(model)
 
     def retune(self, p: Parameters) -> None:
         root = p.sample_period**0.5
@@ -209,14 +182,21 @@ class MovingHorizon(Law):
     def close(self) -> None:
         self._channel.close()
 
-    # --- at every sample -------------------------------------------------------------------------
-
     def update(self, y: float | None, interval: Interval) -> None:
+        if self.adapting and not self._recording:
+            # Another record: the samples before it are not those before the next one.
+            before, end = self._belief, self._channel.record.end
+            self._belief = Belief(
+                kept=Kept(first=end), end=end, next_at=end + FIRST_FIT, published=before.published,
+                inherited=before.inherited or before.published,
+            )
+            self._skipping_fit = self._channel.busy
+        self._recording = self.adapting
         self._lost_in_a_row = self._lost_in_a_row + 1 if y is None else 0
-        following = self._following
+        following, family = self._following, self._setup.family
         following.step(y, interval, self.estimate)
-        resting = following.since_motion > self._setup.family.memory  # longer than G remembers
-        if self._adapting and not (resting and not self._setup.family.integrates):
+        resting = following.since_motion > family.memory  # longer than G remembers
+        if self.adapting and not (resting and not family.integrates):
             self._channel.append(interval.v, nan if y is None else y, interval.other)
         status = self._belief.reason
         if self._lost_in_a_row >= 20:
@@ -231,13 +211,13 @@ class MovingHorizon(Law):
         if channel.busy:
             self._take(channel.poll())
         due = channel.record.end >= self._belief.next_at or following.surprised
-        if channel.busy or not due or not self._adapting or (
+        if channel.busy or not due or not self.adapting or (
             following.observer is not None and following.since_motion > setup.family.memory
         ):
             return
         following.beyond += following.surprised  # once
         channel.submit(
-            fitted, setup, self._belief, self.model.transfer_function, self._proposal.xi,
+            fitted, setup, self._belief, following.model.transfer_function, self._proposal.xi,
             since=self._belief.kept.first,
         )
         self._take(channel.poll())

@@ -18,19 +18,14 @@ from operator import mul
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Estimate
-from backlash_ros.core.estimation.fit import Problem
-from backlash_ros.core.estimation.posterior import WindowFit
 from backlash_ros.core.estimation.settings import GATE, OUTLIERS, ROWS
 from backlash_ros.core.law import Interval
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.plant.backlash import clamp
-from backlash_ros.core.plant.numerics import lyapunov, riccati
+from backlash_ros.core.plant.numerics import Array, lyapunov, riccati
 from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction, powers
-
-Array = NDArray[np.float64]
 
 # Noise on u, as its stationary share of y in units of the noise of y, that gains are made for.
 RATIOS = tuple(10.0**exponent for exponent in range(-4, 5))
@@ -49,6 +44,7 @@ class Gain(NamedTuple):
     quiet: float
 
 
+@lru_cache(maxsize=64)
 def gain_of(model: StateModel, ratio: float) -> Gain:
     """Gain for noise on u of this size; 0 where there is none."""
     n, transfer = model.order, model.transfer_function
@@ -71,45 +67,27 @@ def gain_of(model: StateModel, ratio: float) -> Gain:
     )
 
 
-def gains_of(model: TransferFunction) -> tuple[Gain, ...]:
-    """Gains for noise on u of every size."""
-    return _gains_of(tuple(model.numerator), tuple(model.denominator))
-
-
-@lru_cache(maxsize=16)
-def _gains_of(numerator: tuple[float, ...], denominator: tuple[float, ...]) -> tuple[Gain, ...]:
-    model = StateModel(TransferFunction(numerator, denominator))
-    return tuple(gain_of(model, ratio) for ratio in RATIOS)
-
-
 class Observer:
-    """Follows the state of G. noise_std: of y. gains: where they are known already.
+    """Follows the state of G, kept in the observer form. noise_std: of y.
 
     before: that of another G for the same plant: innovations are no larger with this one. variance:
-    of the innovation, measured. cov: of the state while innovations are what they are, (n, n): the
-    same array until then.
+    of the innovation, measured. cov: of the state in the coordinates of StateModel, (n, n).
     """
 
     def __init__(
         self, model: StateModel, noise_std: float, before: Observer | None = None,
-        gains: tuple[Gain, ...] | None = None,
     ) -> None:
-        self._model, self._gains, self._level = model, gains, -1
-        highest = len(RATIOS) if before is None else before._level
+        self._model, highest = model, len(RATIOS) if before is None else before.level
         self._use(min(len(RATIOS) // 2, highest), noise_std)
         self.variance = (self._gain.innovation * noise_std) ** 2
-        # In the observer form; maps it to the coordinates of StateModel.
         self._x = [0.0] * model.order
         self._to_state = tuple(map(tuple, model.to_state.tolist()))
         # Take u over one period and return the y that is expected after it.
         self.predict = partial(model.transfer_function.advance, self._x)
 
     def _use(self, level: int, noise_std: float) -> None:
-        """Use the gain for this noise on u, and on y."""
-        if level != self._level:
-            # All gains take milliseconds: where no fit brought them, only the one that is needed.
-            self._gain = self._gains[level] if self._gains else gain_of(self._model, RATIOS[level])
-        self._level, self.noise_std = level, noise_std
+        self.level, self.noise_std = level, noise_std
+        self._gain = gain_of(self._model, RATIOS[level])
         self.cov = self._gain.cov * noise_std**2
 
     @property
@@ -120,8 +98,7 @@ class Observer:
     def place(self, x: Array, known: bool) -> None:
         """Go on from the state x in the observer form.
 
-        known: whether a fit knows it better than the newest samples do, which are to move it little
-        then.
+        known: whether it is known better than by the newest samples, which are to move it little.
         """
         self._x[:] = x.tolist()
         if known:
@@ -136,7 +113,7 @@ class Observer:
 
     def settle(self, noise_std: float) -> None:
         """Go a step towards the smallest gain that explains the innovations, with this noise."""
-        gain, level = self._gain, self._level
+        gain, level = self._gain, self.level
         # What chance explains: 15 % of the deviation.
         if self.variance > (1.15 * gain.innovation * noise_std) ** 2:
             level = min(level + 1, len(RATIOS) - 1)
@@ -146,29 +123,16 @@ class Observer:
 
 
 class Place(NamedTuple):
-    """Where play and G stand after the samples of a fit.
+    """Where the samples of a fit leave play and G.
 
-    p: of the play operator. u, y: over the newest samples (M,). x: state of `model` in the observer
-    form. gains: of its observer.
+    p: of the play operator. u, y: over the newest samples (M,). x: state of `model`, observer form.
     """
 
     p: float
     u: Array
     y: Array
-    x: Array
     model: TransferFunction
-    gains: tuple[Gain, ...]
-
-
-def place_of(fit: WindowFit, problem: Problem, model: TransferFunction, memory: int) -> Place:
-    """Where this fit of a record says that play and this G stand after it.
-
-    memory: of G [samples].
-    """
-    p, u = problem.at(fit).p, problem.at(fit).u
-    newest = slice(-min(len(p), 4 * memory, ROWS), None)
-    u, y = u[newest], np.where(problem.known, problem.y, nan)[newest]
-    return Place(float(p[-1]), u, y, state_after(model, u, y), model, gains_of(model))
+    x: Array
 
 
 def state_after(model: TransferFunction, u: Array, y: Array) -> Array:
@@ -210,19 +174,18 @@ class Following:
 
     @property
     def x_hat(self) -> list[float]:
-        """State of G in the coordinates of `model`, n values."""
         if self.observer is not None:
             return self.observer.state
         none: list[float] = [0.0] * self.model.order
         return none if self.before is None else self.before.x_hat.tolist()
 
-    def change_model(self, model: StateModel, gains: tuple[Gain, ...] | None) -> None:
-        """Give the state of this G from now on; gains: of its observer."""
+    def change_model(self, model: StateModel) -> None:
+        """Give the state of this G from now on."""
         self.model = model
         if self.before is not None:
             self.before = self.before.with_model(model)
         if self.observer is not None:
-            self.observer = Observer(model, self.observer.noise_std, self.observer, gains)
+            self.observer = Observer(model, self.observer.noise_std, self.observer)
             y = np.array(self._y)
             if np.isfinite(y).sum() > model.order:
                 x = state_after(model.transfer_function, np.array(self._u), y)
@@ -264,10 +227,10 @@ class Following:
         samples, so that it knows the state better than the newest of them do.
         """
         own, other = self.model.transfer_function, place.model
-        follows = own is other or (np.array_equal(other.denominator, own.denominator)
-                                   and np.array_equal(other.numerator, own.numerator))
+        follows = np.array_equal(other.denominator, own.denominator) \
+            and np.array_equal(other.numerator, own.numerator)
         if self.observer is None:
-            self.observer = Observer(self.model, noise_std, None, place.gains if follows else None)
+            self.observer = Observer(self.model, noise_std)
         else:
             self.observer.settle(noise_std)
         observer = self.observer
