@@ -15,7 +15,7 @@ from backlash_ros.core.estimation.explanations import Setup, Window
 from backlash_ros.core.estimation.fit import Problem
 from backlash_ros.core.estimation.posterior import Prior, Start, WindowFit, agree
 from backlash_ros.core.plant.backlash import Region, engaged, reversals
-from backlash_ros.core.plant.numerics import Array
+from backlash_ros.core.plant.transfer_function import Array
 
 
 class State(Enum):

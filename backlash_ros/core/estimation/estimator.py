@@ -31,8 +31,7 @@ from backlash_ros.core.jobs import ChannelSamples, Executor, Failure
 from backlash_ros.core.law import Interval, Law, LawReport
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.plant.numerics import Array
-from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
+from backlash_ros.core.plant.transfer_function import Array, StateModel, TransferFunction
 
 
 class Proposal(NamedTuple):

@@ -25,7 +25,7 @@ from backlash_ros.core.estimation.posterior import Prior, Start, WindowFit
 from backlash_ros.core.estimation.search import search
 from backlash_ros.core.law import OutOfBounds
 from backlash_ros.core.plant.backlash import engaged, play, reversals
-from backlash_ros.core.plant.numerics import Array
+from backlash_ros.core.plant.transfer_function import Array
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,8 @@ from backlash_ros.core.estimation import posterior, settings
 from backlash_ros.core.estimation.plant_family import Family, delayed, padded, sensitivities
 from backlash_ros.core.estimation.posterior import Prior, WindowFit
 from backlash_ros.core.plant.backlash import Region, engaged, play, reversals
-from backlash_ros.core.plant.numerics import Array, lfilter
+from backlash_ros.core.plant.numerics import lfilter
+from backlash_ros.core.plant.transfer_function import Array
 
 STEPS, FIRST_STEPS, FEW_STEPS = 16, 6, 3  # of Gauss-Newton, at most
 

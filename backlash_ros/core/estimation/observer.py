@@ -24,8 +24,8 @@ from backlash_ros.core.estimation.settings import GATE, OUTLIERS, ROWS
 from backlash_ros.core.law import Interval
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.plant.backlash import clamp
-from backlash_ros.core.plant.numerics import Array, lyapunov, riccati
-from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction, powers
+from backlash_ros.core.plant.numerics import lyapunov, riccati
+from backlash_ros.core.plant.transfer_function import Array, StateModel, TransferFunction, powers
 
 # Noise on u, as its stationary share of y in units of the noise of y, that gains are made for.
 RATIOS = tuple(10.0**exponent for exponent in range(-4, 5))

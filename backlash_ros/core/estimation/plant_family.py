@@ -23,8 +23,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from backlash_ros.core.plant.numerics import Array, lfilter
-from backlash_ros.core.plant.transfer_function import ON_CIRCLE, TransferFunction, memory_of
+from backlash_ros.core.plant.numerics import lfilter
+from backlash_ros.core.plant.transfer_function import ON_CIRCLE, Array, TransferFunction, memory_of
 
 
 class Family(Protocol):

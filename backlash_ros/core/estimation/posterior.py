@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.settings import CHANCE
-from backlash_ros.core.plant.numerics import Array
+from backlash_ros.core.plant.transfer_function import Array
 
 SCALES = np.asarray(np.geomspace(3e-4, 10.0, 14), np.float64)  # of the error of G that are weighed
 

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from backlash_ros.core.estimation.plant_family import Family, sensitivities, state_columns
 from backlash_ros.core.estimation.settings import ROWS
 from backlash_ros.core.plant.backlash import play
-from backlash_ros.core.plant.numerics import Array, lfilter
+from backlash_ros.core.plant.numerics import lfilter
+from backlash_ros.core.plant.transfer_function import Array
 
 
 class Hypothesis(NamedTuple):
