@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from math import inf, nan
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,40 +20,31 @@ from backlash_ros.core.simulation.run_record import turns
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class RecordFit:
-    """What a record says. u = m (p - c_r) with the play output p for the gap c_r - c_l.
-
-    nominal: G as it was given. model: the G that was learned, the same where the data do not speak
-    for another one; both without `delay` [samples]. reasons: why it is of no use to the loop, a
-    sentence each: `doubts` of the values, `against` for y that moves against v, `outside` of the
-    bounds. estimates: value and standard deviation of m (negative where y moves against v), c_r,
-    c_l. fit: None where there is none, of -G where m is negative. predicted: share of the motion of
-    y that it predicts. reversals: of the play output. margins: log-likelihood by which each of the
-    delays that were compared falls behind.
-    """
+class RecordFit(NamedTuple):
+    """What a record says. nominal, model: G as given and as learned, the same where data do not
+    speak for another one. doubts, against, outside: why it is of no use: of the values, y that
+    moves against v, bounds. estimates: m (negative where y moves against v), c_r, c_l with their
+    deviations. fit: of -G where m is negative. predicted: share of the motion of y. reversals: of
+    the play. margins: log-likelihood by which each delay falls behind."""
 
     nominal: TransferFunction
     model: TransferFunction
     doubts: tuple[str, ...] = ()
     against: tuple[str, ...] = ()
     outside: tuple[str, ...] = ()
-    estimates: Mapping[str, tuple[float, float]] = field(
-        default_factory=lambda: dict.fromkeys(('m', 'c_r', 'c_l'), (nan, nan)))
+    estimates: Mapping[str, tuple[float, float]] = dict.fromkeys(('m', 'c_r', 'c_l'), (nan, nan))
     fit: WindowFit | None = None
     predicted: float = nan
     reversals: int = 0
     delay: int = 0
-    margins: Mapping[int, float] = field(default_factory=dict)
+    margins: Mapping[int, float] = {}
 
     @property
     def gap(self) -> float:
-        """Width, nan where there is no fit."""
         return self.fit.gap if self.fit else nan
 
     @property
     def std_gap(self) -> float:
-        """Its standard deviation."""
         return self.fit.gap_std if self.fit else nan
 
     @property
@@ -95,11 +86,11 @@ def fit_record(
         return RecordFit(nominal, nominal, (why,))
     setup = explanations.Setup(PlantFamily(nominal, uncertainty), noise_std, bounds or Bounds(),
                                inf, float(np.ptp(v)), 0.0, np.zeros(3))
-    fits = [replace(_fitted(setup, v[longest - delay:len(v) - 1 - delay], after, bounds),
-                    delay=delay) for delay in delays]
+    fits = [_fitted(setup, v[longest - delay:len(v) - 1 - delay], after, bounds)._replace(
+        delay=delay) for delay in delays]
     evidence = {each.delay: each.fit.evidence if each.fit else -inf for each in fits}
     best = max(fits, key=lambda each: evidence[each.delay])
-    return replace(best, margins={
+    return best._replace(margins={
         delay: evidence[best.delay] - other for delay, other in evidence.items()})
 
 

@@ -1,73 +1,116 @@
 """From v and y to backlash, G(z), delay and noise, with deviations and all that keeps them apart.
 
     the best structure (structure_search.py)  ->  a fit of the whole record
-    ->  deviations (deviations.py), verdict (verdict.py), all in units of the record
+    ->  deviations, verdict (verdict.py), all in units of the record
 
-Search and fit are those of the loop, for plants without a prior (structure.py).
+Search and fit are those of the loop, for plants without a prior (model.py).
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
-from math import inf, log, sqrt
+from dataclasses import dataclass, field, replace
+from math import inf, nan, sqrt
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.fit import FIRST_STEPS
-from backlash_ros.core.identification.deviations import (
-    covariance_of,
-    effective,
-    lag_one,
-    least_response,
-    response_of,
-)
-from backlash_ros.core.identification.rate_limit import limited, rate_limit
-from backlash_ros.core.identification.result import (
-    Details,
-    FoundModel,
-    HeldOut,
-    Identification,
-    Noise,
-    Options,
-)
-from backlash_ros.core.identification.structure import (
-    TINY,
-    VAGUE,
-    Model,
-    Samples,
-    Structure,
-    fitted,
-    moved_to,
-)
-from backlash_ros.core.identification.structure_search import (
-    EARLY,
-    GENERAL_POLES,
-    PLATEAU,
-    Progress,
-    StructureSearch,
-    Units,
-    equal_delays,
-    later,
-    observed_of,
-    searched,
-    without_outliers,
-)
-from backlash_ros.core.identification.verdict import CERTAIN, Findings, judge
+from backlash_ros.core.identification import model as models
+from backlash_ros.core.identification import structure_search as search
+from backlash_ros.core.identification.model import VAGUE, Model, Structure, fitted, moved_to
+from backlash_ros.core.identification.not_play import Observed, limited, rate_limit
+from backlash_ros.core.identification.structure_search import Options, StructureSearch, Units
+from backlash_ros.core.identification.verdict import CERTAIN, Findings, Verdict, judge
+from backlash_ros.core.plant.actuator import Actuator
 from backlash_ros.core.records.readings import quantum
 from backlash_ros.core.records.samples import busiest, check_record, frequencies_of
 
 Array = NDArray[np.float64]
 
 
+class Details(NamedTuple):
+    """What pictures show, in units of the record. first: number of the first y that was fitted; v:
+    as it acts on each y from there on."""
+
+    first: int
+    v: Array
+    observed: Observed
+    response: models.Response
+    held_out: search.HeldOut
+
+
+class FoundModel(NamedTuple):
+    """y = z^-delay numerator / denominator u, for the m that was told. delays: that explain y
+    equally well. response_std: relative deviation of G at `frequencies` [rad/sample], between which
+    y moves. uncertainty: as plant.uncertainty. noise_std, quantum: of y, its step 0 for none."""
+
+    numerator: tuple[float, ...] = ()
+    denominator: tuple[float, ...] = ()
+    delay: int = 0
+    delays: tuple[int, ...] = ()
+    integrator: bool = False
+    frequencies: Array = np.empty(0)
+    response_std: Array = np.empty(0)
+    uncertainty: float = nan
+    noise_std: float = nan
+    quantum: float = 0.0
+    outliers: int = 0
+
+
+@dataclass(frozen=True)
+class Identification:
+    """What was found. std: deviations of gap, c_r, c_l and, for m, of the product of m and the gain
+    of G. refused: why nothing was fitted, or why a controller does not take it. verdict, details:
+    None where nothing was fitted. actuator: between the command and v, where one is known."""
+
+    sample_period: float
+    v: Array
+    y: Array
+    m: float = nan
+    gap: float = nan
+    c_r: float = nan
+    std: dict[str, float] = field(default_factory=dict)
+    model: FoundModel = field(default_factory=FoundModel)
+    refused: str = ''
+    verdict: Verdict | None = None
+    details: Details | None = None
+    actuator: Actuator | None = None
+
+    @property
+    def c_l(self) -> float:
+        return self.c_r - self.gap
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why it is of no use to a controller, a sentence each."""
+        return (self.refused,) if self.refused else self.verdict.reasons if self.verdict else ()
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What to know, a sentence each."""
+        return self.verdict.remarks if self.verdict else ()
+
+    @property
+    def hertz(self) -> Array:
+        """Frequencies at which the deviation of G is told."""
+        return np.asarray(self.model.frequencies / (2.0 * np.pi * self.sample_period))
+
+    def with_remarks(self, *remarks: str) -> Identification:
+        """The same with these remarks, where something was fitted."""
+        return replace(self, verdict=self.verdict and self.verdict._replace(remarks=remarks))
+
+    @property
+    def usable(self) -> bool:
+        return not self.reasons
+
+
 def identify(
     v: Array, y: Array, sample_period: float, options: Options | None = None,
-    progress: Progress = lambda _: None,
 ) -> Identification:
     """Identify v (N,), applied from k to k+1, and y (N,) at k, nan where lost.
 
-    progress: is told what is being done. Raises ValueError for arrays that do not fit together or
-    hold what is no number.
+    Raises ValueError for arrays that do not fit together or hold what is no number.
     """
     options = options or Options()
     v, y = np.asarray(v, dtype=float), np.asarray(y, dtype=float)
@@ -83,67 +126,53 @@ def identify(
     units = Units(float(v.mean()), float(np.ptp(v[part])), float(np.nanmedian(y)),
                   float(np.nanstd(y[part])))
     v, y = (v - units.v) / units.v_size, (y - units.y) / units.y_size
-    s = searched(v[part], y[part], options, options.delays or EARLY, progress)
+    s = search.searched(v[part], y[part], options, options.delays or search.EARLY)
     if not options.delays:
-        s = later(s, options, progress)
-    progress('choosing the delay')
-    best, rows = s.best, effective(s.best.left)
+        s = search.later(s, options)
+    best, samples, rows = s.best, s.samples, models.effective(s.best.left)
     structures = [replace(best.structure, delay=delay)
-                  for delay in equal_delays(s.compared, s.chosen) if delay != best.structure.delay]
-    others = [fitted(s.samples, one, moved_to(one, best)) for one in structures]
+                  for delay in search.equal_delays(s.compared, s.chosen)]
+    others = [fitted(samples, one, moved_to(one, best)) for one in structures
+              if one != best.structure]
     # With as many poles, some of them may fit worse.
-    best = least_response(best, [one for one in others if rows * log(
-        max(one.squares, TINY) / max(best.squares, TINY)) <= PLATEAU])
-    samples = s.samples
+    best = models.least_response(
+        best, [one for one in others if one.behind(best, rows) <= search.PLATEAU])
     if len(v) > len(samples.v):
-        progress('fitting the whole record')
         whole = y.copy()
         whole[part] = samples.y
         samples = replace(samples, v=v, y=whole, last=len(v))
         begin = moved_to(best.structure, best, p0=float(v[0]) + 0.5 * best.gap)
         best = fitted(samples, best.structure, begin, FIRST_STEPS)
-        kept = without_outliers(samples, best)
+        kept = search.without_outliers(samples, best)
         if kept is not samples:
             samples = kept
             best = fitted(samples, best.structure, best.fit)
-        best = least_response(best)
-    progress('judging')
+        best = models.least_response(best)
     s = s._replace(samples=samples, best=best, held_out=s.held_out._replace(
         first=part.start + s.held_out.first))
-    found = _as_a_gain(_described(s, given, options, units), s, given, options, units)
-    return found if slow is None else found.with_remarks([
+    found = _as_a_gain(_described(s, given, options, units), s, options, units)
+    return found if slow is None else found.with_remarks(
         f'v jumps, and the drive follows by at most {slow / sample_period:.4g} per s: the fit is '
-        'to v limited so, as is control.rate_max in the file', *found.remarks])
+        'to v limited so, as is control.rate_max in the file', *found.remarks)
 
 
 def _why_nothing(v: Array, y: Array, options: Options) -> str:
     """Why there is nothing to fit; empty where there is. y: of the part that is searched."""
-    known = np.isfinite(y[max(options.delays or EARLY) + 1:])
+    known = np.isfinite(y[max(options.delays or search.EARLY) + 1:])
     # The first samples of them are fitted alone, to predict the others.
-    fitted = known[:len(known) - round(options.held_out * len(known))]
-    needed = 8 * max(Structure(max(options.orders), 0, False).unknowns,
-                          Structure(GENERAL_POLES, 0, False).unknowns)
-    if fitted.sum() < needed or not known[len(fitted):].any():
+    first = known[:len(known) - round(options.held_out * len(known))]
+    needed = 8 * max(Structure(order, 0, False).unknowns
+                     for order in (max(options.orders), search.GENERAL_POLES))
+    if first.sum() < needed or not known[len(first):].any():
         return (
             f'{int(known.sum())} samples of y are too few, or lie too unevenly, for an order of up '
             f'to {max(options.orders)}, about {round(needed / (1.0 - options.held_out))} are '
-            'needed: record for longer, or limit --order'
-        )
+            'needed: record for longer, or limit --order')
     if np.ptp(v) == 0.0:
         return 'v stood still: move it to and fro, past the gap'
     if np.nanmax(y) == np.nanmin(y):
         return 'y stood still: let v swing wider than the gap, and see that y is measured'
     return ''
-
-
-def _delay_open(samples: Samples, best: Model) -> bool:
-    """Whether one more sample of delay fits as well."""
-    samples = replace(samples, first=samples.first + 1)
-    longer = replace(best.structure, delay=best.structure.delay + 1)
-    this, other = (fitted(samples, structure, moved_to(structure, best))
-                   for structure in (best.structure, longer))
-    ratio = log(max(other.squares, TINY) / max(this.squares, TINY))
-    return bool(best.structure.delay) and effective(this.left) * ratio < PLATEAU
 
 
 def _crossings(best: Model, covariance: Array, units: Units) -> tuple[float, Array]:
@@ -164,96 +193,89 @@ def _described(
     s: StructureSearch, given: Identification, options: Options, units: Units,
 ) -> Identification:
     """Everything there is to say of the best fit."""
-    best, chosen, structure = s.best, s.chosen, s.best.structure
-    covariance = covariance_of(best.problem, best.fit)
+    best, structure = s.best, s.best.structure
+    covariance = models.covariance_of(best.problem, best.fit)
     c_r, crossings = _crossings(best, covariance, units)
-    gap, apart = units.v_size * best.gap, units.v_size * s.apart
     gap_var, c_r_var = np.diag(crossings).tolist()
     c_l_var = max(gap_var + c_r_var - 2.0 * float(crossings[0, 1]), 0.0)
-    g = response_of(best, covariance, units.y_size / units.v_size)
-    low, high = frequencies_of(best.simulated)
-    low = max(low, np.pi / len(best.simulated))
+    g = models.response_of(best, covariance, units.y_size / units.v_size)
+    low, high = frequencies_of(best.run.y)
+    low = max(low, np.pi / len(best.run.y))
     frequencies = np.geomspace(low, max(high, 1.01 * low), 60, dtype=np.float64)
     spread, gain_std = g.std(frequencies), float(g.std(np.zeros(1))[0])
-    middle = np.sqrt(frequencies[:1] * frequencies[-1:])
-    residual, squares, still = best.left, best.squares, _still(best)
+    middle, still = np.sqrt(frequencies[:1] * frequencies[-1:]), _still(best)
     first, measured, simulated, rms, trained = s.held_out
-    held_out = HeldOut(first, units.y + units.y_size * measured,
+    held_out = search.HeldOut(first, units.y + units.y_size * measured,
                        units.y + units.y_size * simulated, units.y_size * rms,
                        units.y_size * trained)
-    delays = tuple(sorted({*equal_delays(s.compared, chosen), structure.delay}))
-    observed = observed_of(s.samples, best, units)
-    step, total = quantum(observed.y), float(g.numerator.sum())
+    delays = tuple(sorted({*search.equal_delays(s.compared, s.chosen), structure.delay}))
+    observed, total = search.observed_of(s.samples, best, units), float(g.numerator.sum())
     static = total if structure.integrator else total / float(g.denominator.sum())
     verdict = judge(Findings(
-        observed, sqrt(gap_var), apart, sqrt(max(c_r_var, 0.0)),
+        observed, sqrt(gap_var), units.v_size * s.apart, sqrt(max(c_r_var, 0.0)),
         float(np.copysign(np.abs(g.at(middle))[0], static)), gain_std, float(spread.max()),
         # Whatever the correlation: what explains nine tenths of y shows v.
-        inf if squares < 0.1 * still
-        else 0.5 * effective(residual) * log(still / max(squares, TINY)),
-        held_out.rms / max(held_out.trained, 1e-300),
+        inf if best.squares < 0.1 * still.squares
+        else 0.5 * still.behind(best, models.effective(best.left)),
         [(units.v_size * rival, behind) for rival, behind in s.rivals],
         # Where many fit alike, the gap does not depend on the delay.
         structure.delay * (structure.delay == max(s.delays) and len(delays) < 3
-                           and _delay_open(s.samples, best)),
-    ))
+                           and _delay_open(s))))
     # What no model explains moves both sides of the gap alike.
     more = 0.25 * (verdict.gap_std**2 - gap_var)
     # As parameters have it: z where G is a gain, for B acts a sample late.
     at_zero = structure.numerator_taps - structure.order
-    free = len(residual) - structure.unknowns
-    details = Details(
-        s.samples.first, units.v + units.v_size * best.problem.v, observed.y, observed.p,
-        observed.simulated, g, held_out)
     return replace(
-        given, m=options.slope, gap=gap, c_r=c_r,
+        given, m=options.slope, gap=units.v_size * best.gap, c_r=c_r, verdict=verdict,
         std={'m': options.slope * gain_std, 'gap': verdict.gap_std,
              'c_r': sqrt(max(c_r_var + more, 0.0)), 'c_l': sqrt(c_l_var + more)},
         model=FoundModel(
             tuple((g.numerator / options.slope).tolist()),
             (*best.denominator.tolist(), *[0.0] * at_zero), structure.delay, delays,
-            structure.integrator, frequencies, spread, _as_parameter(2.0 * float(spread.max()))),
-        noise=Noise(
-            units.y_size * sqrt(squares / max(free, 1)), step, lag_one(residual, certain=True),
-            int((np.isfinite(given.y) & np.isnan(s.samples.y)).sum())),
-        fit=(details, verdict),
-    )
+            structure.integrator, frequencies, spread, _as_parameter(2.0 * float(spread.max())),
+            units.y_size * sqrt(best.squares / max(len(best.left) - structure.unknowns, 1)),
+            quantum(observed.y), int((np.isfinite(given.y) & np.isnan(s.samples.y)).sum())),
+        details=Details(s.samples.first, units.v + units.v_size * best.problem.v, observed, g,
+                        held_out))
+
+
+def _delay_open(s: StructureSearch) -> bool:
+    """Whether one more sample of delay fits as well."""
+    samples, taken = replace(s.samples, first=s.samples.first + 1), s.best.structure
+    this, other = (fitted(samples, structure, moved_to(structure, s.best))
+                   for structure in (taken, replace(taken, delay=taken.delay + 1)))
+    rows = models.effective(this.left)
+    return bool(taken.delay) and other.behind(this, rows) < search.PLATEAU
+
+
+def _still(best: Model) -> Model:
+    """A u that stands still, through the same G."""
+    problem, theta = best.problem, best.fit.theta.copy()
+    theta[2] = 2.0 * float(np.ptp(problem.v))
+    still = replace(best.fit, p0=float(problem.v.max()), theta=theta)
+    return replace(best, fit=problem.begun(still, True))
 
 
 def _as_a_gain(
-    found: Identification, s: StructureSearch, given: Identification, options: Options,
-    units: Units,
+    found: Identification, s: StructureSearch, options: Options, units: Units,
 ) -> Identification:
-    """With a G that is a gain and a delay, where a better one is not known but the gap is.
-
-    A slow log of a position servo tells no more; what moves y otherwise counts as an error of G.
-    """
+    """With a G that is a gain and a delay, where a better one is not known but the gap is: a slow
+    log of a position servo tells no more; what moves y otherwise counts as an error of G."""
     gains = [one for one in s.compared if one.structure.order == 0]
-    assert found.verdict is not None
-    if not gains or not found.verdict.backlash.known or found.verdict.model.known:
+    if not gains or not (found.verdict and found.verdict.backlash.known) \
+            or found.verdict.model.known:
         return found
     chosen = min(gains, key=lambda one: one.whole.squares)
     best = fitted(s.samples, chosen.structure, chosen.trained.fit)
     # What depends on the model.
     apart = s.apart + 0.5 * abs(best.gap - found.gap / units.v_size)
-    gain = _described(
-        s._replace(chosen=chosen, best=best, apart=apart), given, options, units)
-    assert gain.verdict is not None
-    known = gain.verdict.backlash.known and gain.verdict.model.known
-    if not known or apart * units.v_size >= CERTAIN * found.std['gap']:
+    gain = _described(s._replace(chosen=chosen, best=best, apart=apart), found, options, units)
+    if not (gain.verdict and gain.verdict.backlash.known and gain.verdict.model.known) \
+            or apart * units.v_size >= CERTAIN * found.std['gap']:
         return found
     moved = sqrt(best.squares / float(np.var(best.problem.y[best.problem.known])) / len(best.left))
     uncertainty = max(gain.model.uncertainty, _as_parameter(2.0 * moved))
     return replace(gain, model=gain.model._replace(uncertainty=uncertainty))
-
-
-def _still(best: Model) -> float:
-    """Squares left over by a u that stands still, through the same G."""
-    problem, fit = best.problem, best.fit
-    theta = fit.theta.copy()
-    theta[2] = 2.0 * float(np.ptp(problem.v))
-    still = problem.begun(replace(fit, p0=float(problem.v.max()), theta=theta), True)
-    return max(float(np.sum(problem.at(still).error ** 2)), TINY)
 
 
 def _as_parameter(spread: float) -> float:

@@ -1,7 +1,7 @@
 """Motion of v that shows a backlash without hurting anybody: within a range, at limited speed.
 
-For identification at several speeds, amplitudes and rests, in both directions: a lag shows as a gap
-that grows with the speed, and with one speed only, they could not be told apart.
+At several speeds, amplitudes and rests, in both directions: a lag shows as a gap that grows with
+the speed, and with one speed only, they could not be told apart.
 """
 
 from __future__ import annotations
@@ -78,12 +78,8 @@ def waves(
 def strokes(
     low: float, high: float, rate: float, period: float, duration: float, v: float,
 ) -> Iterator[float]:
-    """v(k), one per sample, without end, beginning at v.
-
-    low, high, rate: limits of v and of its speed [v/s]. period: of a sample [s]. duration: in which
-    the record, some 24 strokes across the range, is to be complete [s]. Strokes at the speed limit,
-    with rests between, show what is fast in G.
-    """
+    """v(k), one per sample, without end: strokes at up to the speed limit, with rests between,
+    which show what is fast in G; some 24 across the range within the duration [s]."""
     golden, silver, bronze = 0.6180339887, 0.4142135624, 0.3027756377  # spread evenly, never repeat
     ordinary = min(rate, 24.0 * (high - low) / duration)
     up = v <= 0.5 * (low + high)

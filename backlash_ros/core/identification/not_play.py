@@ -1,20 +1,23 @@
 """What is not a play, or not that alone, named by what it is.
 
-Another nonlinearity takes the place of the play in the same family (linear_family.py); what moves
-y beside v is told by the residual of the fit. Each test returns a sentence, empty where it finds
-nothing.
+Another nonlinearity takes the place of the play before all that is linear, which is solved for
+exactly: what is compared depends on no G that was fitted with a play. What moves y beside v is told
+by the residual of the fit. Tests return a sentence, empty where they find nothing.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from math import copysign
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.identification.linear_family import LinearFamily, Observed, centred
 from backlash_ros.core.plant.backlash import play
+from backlash_ros.core.plant.numerics import lfilter
 
 Array = NDArray[np.float64]
 At = tuple[float, ...]  # parameters of a nonlinearity
@@ -29,11 +32,206 @@ class Answer(NamedTuple):
 
     @property
     def sentence(self) -> str:
-        """Reason and cure."""
         return f'{self.reason}: {self.cure}' if self.cure else self.reason
 
 
+class Candidate(NamedTuple):
+    """Squares that a nonlinearity leaves, its parameters, and what it has y follow."""
+
+    squares: float
+    at: At
+    columns: Array
+
+
+class LinearFamily:
+    """All that is linear between the output of a nonlinearity (N,) and y (N,), nan where lost.
+    v: scaled to 0 to 1, as are the parameters of nonlinearities. rows: samples that are compared.
+    """
+
+    def __init__(self, v: Array, y: Array) -> None:
+        self.low, self.swing = float(v.min()), max(float(np.ptp(v)), 1e-300)
+        self.v = (v - self.low) / self.swing
+        known = np.flatnonzero(np.isfinite(y) & (np.arange(len(y)) >= min(len(y) // 10, 100)))
+        self.rows = known[::max(len(known) // 1500, 1)]
+        self.target = y[self.rows]
+        self.enough = len(self.rows) >= 100 and bool(np.ptp(v) > 0.0)
+        bend = self.v - self.v.mean()
+        self.common = np.column_stack([
+            np.ones(len(v)), np.linspace(-1.0, 1.0, len(v)), bend**2, bend**3])[self.rows]
+
+    def columns(self, w: Array) -> Array:
+        """Three taps, lags and, last, the integral of w (N,)."""
+        w = w - w.mean()
+        steps = np.diff(w, prepend=[w[0], w[0]])
+        found = [w, steps[1:], np.diff(steps)]
+        for lag in (0.7, 2.0, 6.0, 20.0, 60.0):  # [samples]
+            a = float(np.exp(-1.0 / lag))
+            found.append(lfilter([1.0 - a], [1.0, -a], w, state=[w[0] * a]))
+        return np.column_stack([*found, np.cumsum(w)])[self.rows]
+
+    def solved(self, columns: Array, part: slice = slice(None)) -> tuple[float, Array]:
+        """Squares left over of a part of the rows, and the solution for columns and `common`."""
+        whole, target = np.column_stack([columns, self.common])[part], self.target[part]
+        scale = np.sqrt(np.einsum('ij,ij->j', whole, whole))
+        scale[scale == 0.0] = 1.0
+        whole /= scale
+        solution = np.linalg.lstsq(whole.T @ whole, whole.T @ target, rcond=1e-13)[0]
+        left = target - whole @ solution
+        return float(left @ left), solution / scale
+
+    def best(
+        self, nonlinearity: Callable[..., Array], starts: Sequence[At], evaluations: int = 50,
+    ) -> Candidate:
+        """The best parameters of a nonlinearity of v, from the best two starts."""
+        from scipy.optimize import minimize  # a fifth of the time that a start takes
+
+        def left(at: Sequence[float]) -> float:
+            w = nonlinearity(self.v, *at)
+            return self.solved(self.columns(w))[0] if np.ptp(w) > 0.0 else 1e300
+
+        found = sorted((left(at), at) for at in starts)[:2]
+        for _, at in list(found):
+            result = minimize(left, at, method='Nelder-Mead',
+                              options={'maxfev': evaluations, 'xatol': 1e-4})
+            found.append((float(result.fun), tuple(result.x.tolist())))
+        squares, at = min(found)
+        return Candidate(squares, at, self.columns(nonlinearity(self.v, *at)))
+
+    def changing(self, gap: float, basis: Array) -> tuple[Array, Candidate]:
+        """Gaps [v] of a basis (B, N) that make up the width of a play, by Gauss-Newton steps from
+        a constant gap."""
+        widths: Array = np.full(len(basis), max(gap / self.swing, 1e-4))
+        best = widths, Candidate(np.inf, (), np.empty(0))
+        for _ in range(8):
+            half, place, held = 0.5 * np.maximum(widths @ basis, 0.0), float(self.v[0]), []
+            for low, high in zip((self.v - half).tolist(), (self.v + half).tolist(), strict=True):
+                place = min(max(place, low), high)
+                held.append(place)
+            p = np.array(held)
+            columns = self.columns(p)
+            squares, solution = self.solved(columns)
+            if not squares < best[1].squares:
+                break
+            best = widths, Candidate(squares, (), columns)
+            side = np.where(p == self.v - half, -0.5, np.where(p == self.v + half, 0.5, 0.0))
+            last = np.maximum.accumulate(np.where(side != 0.0, np.arange(len(side)), 0))
+            moved = [self.columns((side * one)[last]) @ solution[:columns.shape[1]]
+                     for one in basis]
+            widths = widths + self.solved(np.column_stack([*moved, columns]))[1][:len(basis)]
+        return self.swing * np.maximum(best[0], 0.0), best[1]
+
+    def share(self, other: Candidate, one: Candidate, noise: float) -> float:
+        """Of what `one` leaves beyond the noise, what `other` explains; 0 where that is chance."""
+        beyond = max(one.squares - noise**2 * len(self.rows), 1e-300)
+        # Neighbours of smooth residuals tell little of their own.
+        gain = 0.2 * len(self.rows) * np.log(one.squares / max(other.squares, 1e-300))
+        return (one.squares - other.squares) / beyond if gain >= 15.0 else 0.0
+
+    def beats(self, other: Candidate, one: Candidate, noise: float) -> bool:
+        """Whether `other` explains next to all, and much in both halves of the record."""
+        explained, half = 0.95, len(self.rows) // 2
+        return self.share(other, one, noise) >= explained and all(
+            self.solved(other.columns, part)[0]
+            < (1.0 - 0.5 * explained) * self.solved(one.columns, part)[0]
+            for part in (slice(0, half), slice(half, None)))
+
+
+@dataclass(frozen=True)
+class Observed:
+    """A record and its fit, N samples each. y: nan where lost. p: play output [v], as it acts on y.
+    noise: standard deviation of white noise and rounding of y. gap: that of p."""
+
+    v: Array
+    y: Array
+    p: Array
+    simulated: Array
+    noise: float
+    gap: float
+
+    @property
+    def residual(self) -> Array:
+        return np.asarray(self.y - self.simulated)
+
+    @property
+    def rms(self) -> float:
+        return float(np.sqrt(np.nanmean(self.residual**2)))
+
+    @property
+    def swing(self) -> float:
+        """Of y."""
+        return float(np.nanmax(self.y) - np.nanmin(self.y))
+
+    @property
+    def unexplained(self) -> bool:
+        """Whether the residual is more than noise."""
+        return self.rms > max(1.5 * self.noise, 1e-3 * self.swing) and self.family.enough
+
+    @cached_property
+    def family(self) -> LinearFamily:
+        """To compare nonlinearities by, over some of the record."""
+        return LinearFamily(self.v[:4000], self.y[:4000])
+
+    @cached_property
+    def one_play(self) -> Candidate:
+        """The best play."""
+        widths = (6e-4, 3e-3, 0.01, 0.03, 0.1, 0.2, 0.4, 0.6, 0.8, self.gap / self.family.swing)
+        return self.family.best(centred, [(width,) for width in widths])
+
+
 # --- nonlinearities of v (N,), scaled to 0 to 1, and what is said of them -------------------------
+
+
+def centred(v: Array, width: float) -> Array:
+    """Play about its middle."""
+    width = abs(width)
+    return play(v, width, float(v[0]) + 0.5 * width) - 0.5 * width
+
+
+def coasting(v: Array, width: float, dry: float, viscous: float) -> Array:
+    """Play with a load that runs on from the side that it leaves, braked by dry friction and by a
+    share of its speed each sample."""
+    half, dry, kept = 0.5 * abs(width), abs(dry), 1.0 - min(abs(viscous), 1.0)
+    place, speed, out = float(v[0]), 0.0, []
+    for value in v.tolist():
+        speed = copysign(max(kept * abs(speed) - dry, 0.0), speed)
+        on = min(max(place + speed, value - half), value + half)
+        if on != place + speed:
+            speed = on - place
+        place = on
+        out.append(place)
+    return np.array(out)
+
+
+def limited(v: Array, step: float) -> Array:
+    """v (N,), followed with steps of at most so much."""
+    step, place, out = abs(step), float(v[0]), []
+    for value in v.tolist():
+        place += min(max(value - place, -step), step)
+        out.append(place)
+    return np.array(out)
+
+
+def rate_limit(v: Array, y: Array) -> float | None:
+    """Largest step of v (N,) that a drive followed, as y (N,) shows: v jumps, and what reaches the
+    play follows as a ramp. None where a play explains y without it, or v never jumps."""
+    jump = 0.05  # step of v that a drive may be too slow for [swing of v]
+    family = LinearFamily(v, y)
+    largest = float(np.max(np.abs(np.diff(family.v)), initial=0.0))
+    if largest < jump or not family.enough:
+        return None
+
+    def following(v: Array, octaves: float, width: float) -> Array:
+        return centred(limited(v, largest * 2.0**octaves), width)
+
+    play_alone = family.best(centred, [(width,) for width in (6e-4, 0.01, 0.1, 0.3)])
+    slow = family.best(following, [
+        (octaves, width) for octaves in (-1.0, -2.5, -4.0, -6.0) for width in (0.003, 0.03)])
+    # Nothing is known of the noise yet: it counts as left over.
+    if not family.beats(slow, play_alone, 0.0):
+        return None
+    # Along a ramp, a small error of its slope adds up.
+    octaves = family.best(following, [slow.at]).at[0]
+    return float(family.swing * largest * 2.0**octaves)
 
 
 def _ended(v: Array, width: float, low: float, high: float, beyond: float = 0.0) -> Array:
@@ -43,41 +241,38 @@ def _ended(v: Array, width: float, low: float, high: float, beyond: float = 0.0)
     return np.asarray(within + beyond * (p - within))
 
 
-def _end(o: Observed, f: LinearFamily, at: At) -> str:
-    width, low, high = at
+def _end(o: Observed, at: At) -> str:
+    f, (width, low, high) = o.family, at
     squares = [f.solved(f.columns(_ended(f.v, width, low, high, beyond)))[0]
                for beyond in (0.0, 0.3)]
     p = centred(f.v, width)
     on, y = max(((float(beyond.max()), f.target[beyond[f.rows] > 0.0])
                  for beyond in (p - max(low, high), min(low, high) - p)), key=lambda end: end[0])
     # A y that only moves less there is at no end.
-    there = squares[0] <= squares[1] and on >= 0.1 and len(y)
-    return _at_end(float(np.median(y)), f.swing * on) if there else ''
-
-
-def _at_end(y: float, on: float) -> str:
-    return (f'y stays at about {y:.4g} while v goes on by {on:.3g} and more: the sensor is at its '
-            'end, or the load slides there')
+    if squares[0] > squares[1] or on < 0.1 or not len(y):
+        return ''
+    return (f'y stays at about {np.median(y):.4g} while v goes on by {f.swing * on:.3g} and more: '
+            'the sensor is at its end, or the load slides there')
 
 
 def _dead(v: Array, low: float, high: float) -> Array:
     return np.asarray(v - np.clip(v, min(low, high), max(low, high)))
 
 
-def _zone(_: Observed, f: LinearFamily, at: At) -> str:
-    low, high = (f.low + f.swing * end for end in sorted(at))
+def _zone(o: Observed, at: At) -> str:
+    low, high = (o.family.low + o.family.swing * end for end in sorted(at))
     return (f'v does nothing from {low:.4g} to {high:.4g}, from wherever it comes: a dead zone, '
             'which has no memory, and no backlash')
 
 
-def _leading(v: Array, width: float) -> Array:
+def _compensated(v: Array, width: float) -> Array:
     """Play, compensated twice."""
     return np.asarray(2.0 * v - centred(v, width))
 
 
-def _lead(o: Observed, f: LinearFamily, at: At) -> str:
-    return (f'y leads v by {f.swing * abs(at[0]):.3g} where v turns: the drive compensates a '
-            'backlash already, by too much') * (abs(at[0]) > abs(o.one_play.at[0]) + 0.002)
+def _lead(o: Observed, at: At) -> str:
+    return (f'y leads v by {o.family.swing * abs(at[0]):.3g} where v turns: the drive compensates '
+            'a backlash already, by too much') * (abs(at[0]) > abs(o.one_play.at[0]) + 0.002)
 
 
 def _many(v: Array, widest: float, share: float) -> Array:
@@ -88,9 +283,9 @@ def _many(v: Array, widest: float, share: float) -> Array:
     return np.asarray(share * v + (1.0 - share) * held.mean(axis=0))
 
 
-def _widest(_: Observed, f: LinearFamily, at: At) -> str:
-    return (f'many plays in parallel explain it, up to {f.swing * abs(at[0]):.3g} wide: y turns '
-            'smoothly, as with friction along the way or in a piezo')
+def _widest(o: Observed, at: At) -> str:
+    return (f'many plays in parallel explain it, up to {o.family.swing * abs(at[0]):.3g} wide: y '
+            'turns smoothly, as with friction along the way or in a piezo')
 
 
 def _sticking(v: Array, band: float, jump: float) -> Array:
@@ -111,36 +306,22 @@ def _sticking(v: Array, band: float, jump: float) -> Array:
     return np.array(out)
 
 
-def _stuck(_: Observed, f: LinearFamily, at: At) -> str:
+def _stuck(o: Observed, at: At) -> str:
     band, jump = abs(at[0]), min(abs(at[1]), abs(at[0]))
-    return (f'y sticks until v has gone on by {f.swing * band:.3g} behind each turn, and jumps by '
-            f'what {f.swing * jump:.3g} of v move: friction, as in a valve') * (jump > 0.1 * band)
+    return (f'y sticks until v has gone on by {o.family.swing * band:.3g} behind each turn, and '
+            f'jumps by what {o.family.swing * jump:.3g} of v move: friction, as in a valve') * (
+                jump > 0.1 * band)
 
 
-# --- what moves y beside v, or is left over -------------------------------------------------------
-
-
-def _held(o: Observed) -> str:
-    """A y that is seen at its end while v goes on."""
-    known = np.isfinite(o.y)
-    # About 1 or -1, but next to 0 where G integrates.
-    along = float(np.corrcoef(o.v[known], o.y[known])[0, 1])
-    within = 4.0 * o.noise + 0.005 * o.swing
-    # What would move y by far more, if it moved.
-    far = max(0.1, 3.0 * within / o.swing) * float(np.ptp(o.v))
-    for end, way in ((np.nanpercentile(o.y, 98.0), 1.0), (np.nanpercentile(o.y, 2.0), -1.0)):
-        on = [float(np.max((o.v[run] - o.v[run[0]]) * way * np.sign(along)))
-              for run in _runs(np.abs(o.y - end) < within)]
-        if abs(along) > 0.3 and sum(size > far for size in on) >= 3:
-            return _at_end(float(end), max(on))
-    return ''
+# --- what moves y beside v ------------------------------------------------------------------------
 
 
 def _pushed(o: Observed) -> str:
     """A y that moves while v is at rest."""
     settled = 8  # samples of v at rest, behind as many in which y settles
-    rest = np.append(False, (np.diff(o.v) == 0.0) & (np.diff(o.p) == 0.0))
-    parts = [o.residual[run[settled:]] for run in _runs(rest)]
+    at_rest = np.flatnonzero(np.append(False, (np.diff(o.v) == 0.0) & (np.diff(o.p) == 0.0)))
+    runs = np.split(at_rest, np.flatnonzero(np.diff(at_rest) > 1) + 1)
+    parts = [o.residual[run[settled:]] for run in runs]
     moved = [float(np.nanmax(part) - np.nanmin(part)) for part in parts
              if np.isfinite(part).sum() >= settled]
     # Of white noise, the range of a few dozen readings is some four deviations.
@@ -167,85 +348,43 @@ def _creep(o: Observed) -> str:
             'or y drifts')
 
 
-def _stick_slip(o: Observed) -> str:
-    """A y that stays where it should move, and then jumps, how far ever."""
-    fewest_moves = 20
-    known = np.flatnonzero(np.isfinite(o.y) & np.append(False, np.diff(o.p) != 0.0))
-    simulated, y, moved = o.simulated[known], o.y[known], 8.0 * o.noise
-    # From each reading to the one by which y should have moved clearly.
-    path = np.append(0.0, np.cumsum(np.abs(np.diff(simulated))))[:len(known)]
-    ahead = np.searchsorted(path, path + moved)
-    begin = np.flatnonzero(ahead < len(y))
-    should = simulated[ahead[begin]] - simulated[begin]
-    clear = np.abs(should) > 0.5 * moved
-    if np.count_nonzero(clear) < fewest_moves:
-        return ''
-    share = (y[ahead[begin]] - y[begin])[clear] / should[clear]
-    stuck = float(np.mean(np.abs(share) < 0.3))
-    if stuck < 0.35 or np.mean(share > 2.0) < 0.04:
-        return ''
-    return (f'y sticks and slips: it stays for {stuck:.0%} of the time in which it should move, '
-            f'and goes on in jumps of up to {np.percentile(abs(np.diff(y)), 99.0):.2g}: friction')
-
-
-def _runs(flags: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
-    """The indices of each run of true ones."""
-    true = np.flatnonzero(flags)
-    return np.split(true, np.flatnonzero(np.diff(true) > 1) + 1) if len(true) else []
-
-
 # --- what is compared -----------------------------------------------------------------------------
 
-
-class Other(NamedTuple):
-    """A nonlinearity, parameters to begin with, what to say of it, and the cure."""
-
-    nonlinearity: Callable[..., Array]
-    starts: Callable[[float], Sequence[At]]  # of the width of the best play
-    said: Callable[[Observed, LinearFamily, At], str]
-    cure: str
-
-
-LESS_FAR = 'move v less far'
-NONLINEARITIES = (
-    Other(_ended, lambda width: [
+# A nonlinearity, where to begin (of the width of the best play), what to say of it, and the cure.
+NONLINEARITIES: tuple[tuple[
+    Callable[..., Array], Callable[[float], Sequence[At]], Callable[[Observed, At], str], str], ...
+] = (
+    (_ended, lambda width: [
         (one, low, high) for one in (width, 0.0)
-        for low, high in ((-1.0, 0.75), (0.25, 2.0), (0.2, 0.8), (0.35, 0.65))], _end, LESS_FAR),
-    Other(_dead, lambda _: [(middle - half, middle + half) for middle in (0.3, 0.5, 0.7)
-                            for half in (0.03, 0.1, 0.2, 0.3)],
-          _zone, 'remove it where it is made, it is not compensated here'),
-    Other(_leading, lambda _: [(width,) for width in (0.003, 0.01, 0.03, 0.1, 0.2, 0.4)],
-          _lead, 'switch that off, or leave it to it'),
-    Other(_many, lambda _: [(widest, share) for widest in (0.1, 0.3, 0.7) for share in (0.0, 0.4)],
-          _widest, 'only a single backlash is compensated here'),
-    Other(_sticking, lambda width: [(wider * width, share * width) for wider, share in (
+        for low, high in ((-1.0, 0.75), (0.25, 2.0), (0.2, 0.8), (0.35, 0.65))],
+     _end, 'move v less far'),
+    (_dead, lambda _: [(middle - half, middle + half) for middle in (0.3, 0.5, 0.7)
+                       for half in (0.03, 0.1, 0.2, 0.3)],
+     _zone, 'remove it where it is made, it is not compensated here'),
+    (_compensated, lambda _: [(width,) for width in (0.003, 0.01, 0.03, 0.1, 0.2, 0.4)],
+     _lead, 'switch that off, or leave it to it'),
+    (_many, lambda _: [(widest, share) for widest in (0.1, 0.3, 0.7) for share in (0.0, 0.4)],
+     _widest, 'only a single backlash is compensated here'),
+    (_sticking, lambda width: [(wider * width, share * width) for wider, share in (
         (1.05, 0.1), (1.3, 0.4), (1.3, 0.8), (1.0, 0.6))], _stuck, 'loosen it'),
 )
-BESIDE_V = ((_held, LESS_FAR), (_pushed, 'hold it, or keep it free'),
+BESIDE_V = ((_pushed, 'hold it, or keep it free'),
             (_creep, 'mend what slips, or measure y without a drift'))
-LEFT_OVER = ((_stick_slip, 'loosen it, or move faster'),)
 
 
 def what_it_is(o: Observed) -> Answer | None:
     """What else than one play y shows; None where one explains it."""
     if not o.unexplained:
         return None
-    return _first(o, BESIDE_V) or best_other(o) or _first(o, LEFT_OVER)
+    beside = ((test(o), cure) for test, cure in BESIDE_V)
+    return next((Answer(False, *one) for one in beside if one[0]), None) or best_other(o)
 
 
 def best_other(o: Observed) -> Answer | None:
     """The best of the nonlinearities that explain y far better than a play does."""
-    family, found = o.family, []
-    if family is None:
-        return None
-    for other in NONLINEARITIES:
-        best = family.best(other.nonlinearity, other.starts(abs(o.one_play.at[0])))
-        if family.beats(best, o.one_play, o.noise):
-            found.append((best.squares, other.said(o, family, best.at), other.cure))
-    named = [one for one in found if one[1]]
-    return Answer(False, *min(named)[1:]) if named else None
-
-
-def _first(o: Observed, tests: Sequence[tuple[Callable[[Observed], str], str]]) -> Answer | None:
-    found = ((test(o), cure) for test, cure in tests)
-    return next((Answer(False, reason, cure) for reason, cure in found if reason), None)
+    named = []
+    for nonlinearity, starts, said, cure in NONLINEARITIES:
+        best = o.family.best(nonlinearity, starts(abs(o.one_play.at[0])))
+        if o.family.beats(best, o.one_play, o.noise):
+            named.append((best.squares, said(o, best.at), cure))
+    return next((Answer(False, *one[1:]) for one in sorted(named) if one[1]), None)

@@ -6,14 +6,19 @@ Everything is judged by numbers and signals; nothing here knows how the fit was 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from math import log
+from math import log, nan
 from typing import NamedTuple
 
 import numpy as np
 
-from backlash_ros.core.identification.deviations import by_model, effective, lag_one
-from backlash_ros.core.identification.linear_family import LinearFamily, Observed
-from backlash_ros.core.identification.not_play import Answer, what_it_is
+from backlash_ros.core.identification.model import by_model, effective, lag_one
+from backlash_ros.core.identification.not_play import (
+    Answer,
+    LinearFamily,
+    Observed,
+    coasting,
+    what_it_is,
+)
 from backlash_ros.core.records.readings import quantum
 
 PRECISE = 0.1  # relative deviation of gap, gain and G that are known
@@ -51,12 +56,10 @@ class Verdict(NamedTuple):
 class Findings(NamedTuple):
     """What there is to judge by, beside the signals of the fitted samples.
 
-    gap_std, c_r_std [v]; apart: deviation of the gap by other structures. gain: mean response of y
-    to v where y moves, with its sign. gain_std, response_std: relative deviations of the gain at
-    rest, and of G where y moves. evidence: log-likelihood by which the fit beats a u that stands
-    still. later: rms of the errors on the samples held out over that on the others. rivals: other
-    gaps with the log-likelihood by which they fall behind. open_delay: the longest that was
-    compared, where a longer one fits as well, else 0.
+    apart: deviation of the gap by other structures. gain: of y over v where y moves. gain_std,
+    response_std: relative deviations of the gain at rest, and of G where y moves. evidence:
+    log-likelihood by which the fit beats a u that stands still. rivals: other gaps, and by how much
+    they fall behind. open_delay: the longest that was compared, where a longer one fits as well.
     """
 
     observed: Observed
@@ -67,13 +70,11 @@ class Findings(NamedTuple):
     gain_std: float
     response_std: float
     evidence: float
-    later: float
     rivals: Sequence[tuple[float, float]]
     open_delay: int
 
     @property
     def gap(self) -> float:
-        """That was found [v]."""
         return self.observed.gap
 
     @property
@@ -132,7 +133,7 @@ def _doubts(f: Findings) -> Iterator[Doubt]:
     # A delay that is too short by a sample looks like a gap that is wider by its motion of v.
     yield Doubt(bool(f.open_delay) * float(np.abs(np.diff(o.v)).mean()),
                 'the delay may be a longer one', 'compare longer ones with --delay')
-    if o.unexplained and o.family is not None:
+    if o.unexplained:
         gap = abs(o.one_play.at[0]) * o.family.swing
         squares, rows = o.one_play.squares / len(o.family.rows), effective(o.residual)
         # Each of its columns costs as much as an unknown of any other structure.
@@ -145,9 +146,13 @@ def _doubts(f: Findings) -> Iterator[Doubt]:
 def _coasts(f: Findings) -> Iterator[Doubt]:
     """Where a load that runs on within the gap explains y better, with another gap."""
     o = f.observed
-    if o.rms > 1.1 * o.noise and o.family is not None:
-        gap = abs(o.coasting.at[0]) * o.family.swing
-        share = min(o.family.share(o.coasting, o.one_play, o.noise), 1.0)
+    if o.rms > 1.1 * o.noise and o.family.enough:
+        width = o.one_play.at[0]
+        best = o.family.best(coasting, [
+            (start, *brakes) for start in (width, 1.3 * width, 1.3 * f.gap / o.family.swing)
+            for brakes in ((0.0, 0.0), (3e-4, 0.0), (3e-3, 0.0), (0.0, 0.03), (0.0, 0.2))], 100)
+        gap = abs(best.at[0]) * o.family.swing
+        share = min(o.family.share(best, o.one_play, o.noise), 1.0)
         yield Doubt(share * abs(gap - f.gap), 'the load coasts while v crosses the gap, which '
                     f'would be {gap:.3g} with that', 'brake it, or move more slowly')
 
@@ -175,50 +180,43 @@ def _changes(f: Findings) -> Iterator[Doubt]:
 def _backlash(f: Findings, most: Doubt, spread: float, coasts: bool) -> Answer:
     """Whether the gap is known, or that there is none. coasts: so far that it is another one."""
     roughly = 0.25  # relative deviation of a gap that is known
-    p, swing = f.observed.p, f.swing
-    way = np.sign(np.diff(p))
+    o, way = f.observed, np.sign(np.diff(f.observed.p))
     turns = int(np.count_nonzero(np.diff(way[way != 0.0])))
-    alike = [rival for rival, behind in f.rivals if behind < 6.0
-             and abs(rival - f.gap) > max(5.0 * f.gap_std, ANOTHER * f.gap)]
-    if f.evidence < 15.0:
-        return Answer(False, f'y shows nothing of v, which swung by {swing:.4g}', 'let v swing '
-                      'wider than the gap, and see that v is what the actuator gets')
-    if f.gap >= 0.95 * swing:
-        return Answer(False, f'the gap is at its bound, the swing of v ({swing:.4g})',
-                      'let v swing wider, past the gap in both directions')
-    if turns < 3:  # fewer leave gap, crossings and start entangled
-        return Answer(False, f'v went past the gap and back {turns} times, 3 are needed',
-                      'move it to and fro more often, or record for longer')
-    if alike:
-        return Answer(False, f'two gaps fit alike, {f.gap:.4g} and {alike[0]:.4g}', SEVERAL)
+    rival = next((rival for rival, behind in f.rivals if behind < 6.0
+                  and abs(rival - f.gap) > max(5.0 * f.gap_std, ANOTHER * f.gap)), nan)
     unexplained = f.unexplained > 0.5 * max(f.gap, CERTAIN * f.gap_std)
     of_noise = most.deviation <= max(f.gap_std, 0.3 * f.unexplained)
-    if f.gap <= CERTAIN * spread and of_noise and not unexplained:
-        return _no_gap(f, spread)
+    none = f.gap <= CERTAIN * spread and of_noise and not unexplained
+    # Of what moves y otherwise, a gap may be four deviations that was not found.
+    bound = f.gap + CERTAIN * spread + 4.0 * f.unexplained
+    may_be = f'a gap of up to {bound:.2g} cannot be ruled out'
+    for holds, reason, cure in (
+        (f.evidence < 15.0, f'y shows nothing of v, which swung by {f.swing:.4g}',
+         'let v swing wider than the gap, and see that v is what the actuator gets'),
+        (f.gap >= 0.95 * f.swing, f'the gap is at its bound, the swing of v ({f.swing:.4g})',
+         'let v swing wider, past the gap in both directions'),
+        # Fewer leave gap, crossings and start entangled.
+        (turns < 3, f'v went past the gap and back {turns} times, 3 are needed',
+         'move it to and fro more often, or record for longer'),
+        (np.isfinite(rival), f'two gaps fit alike, {f.gap:.4g} and {rival:.4g}', SEVERAL),
+        (none and bound > max(0.02 * f.swing, f.quantum / max(abs(f.gain), 1e-300)), may_be,
+         'record for longer, or turn v more often and faster'),
+        (none and f.gain_std > PRECISE, f'{may_be}: the gain of G at rest is not known, and a slow '
+         'lag looks like a gap', 'move v at several speeds, with rests'),
+        # Rounding of v as well as of y leaves a step, and some more while both move.
+        (none and o.rms > max(2.0 * o.noise, 1.5 * f.quantum),
+         f'{may_be}: the fit leaves {o.rms:.2g}, and the noise of y is {o.noise:.2g}',
+         'see the residual on the page'),
+    ):
+        if holds:
+            return Answer(False, reason, cure)
+    if none:
+        return Answer(True, f'there is no backlash: the gap is below {bound:.2g}')
     if spread <= roughly * f.gap and not unexplained and not coasts:
         rough = f', known to {100.0 * spread / f.gap:.2g} % only' * (spread > PRECISE * f.gap)
         return Answer(True, f'the gap is {f.gap:.4g} ± {spread:.2g}{rough}')
     return Answer(False, f'the gap, about {f.gap:.3g}, is known to ± {spread:.2g} only: {most.why}',
                   most.cure)
-
-
-def _no_gap(f: Findings, spread: float) -> Answer:
-    """Where 0 lies within the deviations of the gap: whether that is a gap of 0."""
-    o = f.observed
-    # Of what moves y otherwise, a gap may be four deviations that was not found.
-    bound = f.gap + CERTAIN * spread + 4.0 * f.unexplained
-    text = f'a gap of up to {bound:.2g} cannot be ruled out'
-    if bound > max(0.02 * f.swing, f.quantum / max(abs(f.gain), 1e-300)):
-        return Answer(False, text, 'record for longer, or turn v more often and faster')
-    if f.gain_std > PRECISE:
-        return Answer(
-            False, f'{text}: the gain of G at rest is not known, and a slow lag looks like a gap',
-            'move v at several speeds, with rests')
-    # Rounding of v as well as of y leaves a step, and some more while both move.
-    if o.rms > max(2.0 * o.noise, 1.5 * f.quantum):
-        return Answer(False, f'{text}: the fit leaves {o.rms:.2g}, and the noise of y is '
-                      f'{o.noise:.2g}', 'see the residual on the page')
-    return Answer(True, f'there is no backlash: the gap is below {bound:.2g}')
 
 
 def _gain(f: Findings) -> Answer:
@@ -233,19 +231,18 @@ def _gain(f: Findings) -> Answer:
 
 def _model(f: Findings) -> Answer:
     """Whether G is known well enough to begin with."""
-    spread = f.response_std
-    much = f'{100.0 * spread:.2g} %' if spread < 1.0 else 'nothing'
+    much = f'{100.0 * f.response_std:.2g} %' if f.response_std < 1.0 else 'nothing'
     if f.c_r_std > f.swing:
         return Answer(
             False, f'the middle of the gap is known to ± {f.c_r_std:.2g} only, further than v '
             'moved', 'move v further and with rests; a y that drifts hides it')
-    if spread <= PRECISE:
-        return Answer(True, f'G is known to {much}, good enough to start with')
-    if spread <= 0.5:
-        return Answer(True, f'G is known to {much}: good enough to start the controller with '
-                      'plant.uncertainty as in identified.yaml, which learns the rest')
-    return Answer(False, f'G, where y moves, is known to {much}',
-                  'move v at more speeds, record for longer, or limit --order')
+    if f.response_std > 0.5:
+        return Answer(False, f'G, where y moves, is known to {much}',
+                      'move v at more speeds, record for longer, or limit --order')
+    return Answer(True, f'G is known to {much}' + (
+        ', good enough to start with' if f.response_std <= PRECISE else
+        ': good enough to start the controller with plant.uncertainty as in identified.yaml, '
+        'which learns the rest'))
 
 
 def _remarks(f: Findings) -> Iterator[str]:
@@ -253,18 +250,17 @@ def _remarks(f: Findings) -> Iterator[str]:
     share = f.unexplained / f.gap if f.gap > 0.0 else 0.0
     speeds = np.abs(np.diff(f.observed.v))
     speeds = speeds[speeds > 0.01 * speeds.max(initial=0.0)]
-    if f.gain < 0.0 and f.gain_std <= PRECISE:
-        yield 'y moves against v: the gain of G is negative'
-    if f.open_delay:
-        yield (f'the delay of {f.open_delay} samples is the longest that was compared, and the gap '
-               'may have some of a longer one: try '
-               f'--delay {f.open_delay}-{min(2 * f.open_delay + 4, 40)}')
-    if WORTH_A_WORD < share <= 1.0:
-        yield (f'{share:.0%} of the motion that the gap makes follows from no backlash and no '
-               'linear G: the deviations tell of it')
-    if len(speeds) and np.std(speeds) < 0.05 * np.mean(speeds):
-        yield ('v moved at one speed only: a lag before the gap would look like a wider gap; move '
-               'v at several speeds')
-    if f.later > 2.0 and f.observed.rms > f.observed.noise:
-        yield (f'the last part of the record is predicted {f.later:.2g} times worse than the rest '
-               'is fitted: the plant changed on the way, or the record is short')
+    for holds, text in (
+        (f.gain < 0.0 and f.gain_std <= PRECISE, 'y moves against v: the gain of G is negative'),
+        (f.open_delay > 0,
+         f'the delay of {f.open_delay} samples is the longest that was compared, and the gap may '
+         f'have some of a longer one: try --delay {f.open_delay}-{min(2 * f.open_delay + 4, 40)}'),
+        (WORTH_A_WORD < share <= 1.0,
+         f'{share:.0%} of the motion that the gap makes follows from no backlash and no linear G: '
+         'the deviations tell of it'),
+        (len(speeds) > 0 and np.std(speeds) < 0.05 * np.mean(speeds),
+         'v moved at one speed only: a lag before the gap would look like a wider gap; move v at '
+         'several speeds'),
+    ):
+        if holds:
+            yield text

@@ -17,8 +17,7 @@ def make_parser() -> argparse.ArgumentParser:
     """The options."""
     parser = OptionParser(
         'identify', description=__doc__,
-        epilog='Exit codes: 0 the backlash is known, 1 it is not, 2 bad input.',
-    )
+        epilog='Exit codes: 0 the backlash is known, 1 it is not, 2 bad input.')
     parser.add_argument('record', type=Path, nargs='?', metavar='RECORD',
                         help='a bag, a folder of results, or a table (CSV and the like, Parquet) '
                              'with the time, the command v and the output y')
@@ -90,8 +89,12 @@ def _identify(args: Sequence[str] | None) -> bool:
     if ros_arguments and not options.drive:
         parser.error('--ros-args are for --drive')
     span = span_of(parser, options)
-    given = _given_values(options.config, options.axis)
+    given: Mapping[str, Value] = {}
     # numpy, scipy and matplotlib are loaded once the options are known to be right.
+    if options.config is not None:
+        from backlash_ros.tools.config import read_configuration
+        configuration = read_configuration(options.config)
+        given = configuration.given(options.axis if configuration.axes else '')
     if options.drive:
         from backlash_ros.tools.identify.drive import drive
         if options.axis:
@@ -102,14 +105,5 @@ def _identify(args: Sequence[str] | None) -> bool:
         period = options.period or given.get('sample_period')
         record = read_record(options.record, period if isinstance(period, float) else None, span,
                              options.axis, options.columns)
-    from backlash_ros.tools.identify.outcome import identified, write_outcome
-    return write_outcome(identified(record, options), record, given, options)
-
-
-def _given_values(config: Path | None, axis: str) -> Mapping[str, Value]:
-    """What the user's file holds for the axis; nothing without a file."""
-    if config is None:
-        return {}
-    from backlash_ros.tools.config import read_configuration
-    configuration = read_configuration(config)
-    return configuration.given(axis if configuration.axes else '')
+    from backlash_ros.tools.identify.outcome import identify_record, write_outcome
+    return write_outcome(identify_record(record, options), record, given, options)

@@ -8,9 +8,8 @@ import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
@@ -18,11 +17,8 @@ from functools import partial
 from pathlib import Path
 from typing import TextIO
 
-import numpy as np
-from tqdm import tqdm
-
 from backlash_ros import topics
-from backlash_ros.core.identification.result import Identification
+from backlash_ros.core.identification.identification import Identification
 from backlash_ros.core.parameters import Parameters, Value
 from backlash_ros.core.records.record import Record, RecordError
 from backlash_ros.middleware import ROS_MISSING, ros_is_missing
@@ -48,25 +44,23 @@ def drive(
         path.touch()
         period = given.get('sample_period')
         write_config(Parameters(dict(given)), config)
-        command = [
-            sys.executable, '-m', 'backlash_ros.nodes.drive',
-            '--messages', str(path), '--config', str(config),
-        ]
+        command = [sys.executable, '-m', 'backlash_ros.nodes.drive',
+                   '--messages', str(path), '--config', str(config)]
         for name in ('duration', 'wait', 'rest', 'amplitude', 'rate', 'output_range'):
             value = getattr(options, name)
             if value is not None:
                 values = value if isinstance(value, list) else [value]
                 command += [f'--{name.replace("_", "-")}', *map(str, values)]
         with path.open(encoding='ascii') as file:
-            messages = _Messages(file, period if isinstance(period, float) else None)
+            records = _records(file, period if isinstance(period, float) else None)
             # A group of its own: a Ctrl-C reaches this process alone, which passes it on.
             child = subprocess.Popen([*command, *ros_arguments], start_new_session=True,
                                      stdout=sys.stderr)
             try:
-                _follow(child, messages, options, stop)
+                _follow(child, records, options, stop)
             finally:
                 _end(child, stop)
-            record = messages.record()
+            record = next(records)
         if child.returncode == BAD_INPUT:
             raise InputError('the actuator was not moved, see above')
         if stop.count:
@@ -76,93 +70,52 @@ def drive(
         return record
 
 
-class _Messages:
-    """What the node has written so far: topic, stamp [ns], value on each line."""
+def _records(file: TextIO, period: float | None) -> Iterator[Record | None]:
+    """The record of what the node has written so far, None while it is none yet, each time anew.
 
-    def __init__(self, file: TextIO, period: float | None) -> None:
-        self._file, self._period, self._unfinished = file, period, ''
-        self._heard: dict[str, list[tuple[int, float]]] = {}
-
-    def record(self) -> Record | None:
-        """The record, None while it is none yet."""
-        *lines, self._unfinished = (self._unfinished + self._file.read()).split('\n')
+    On each line of the file: topic, stamp [ns], value.
+    """
+    unfinished, heard = '', dict[str, list[tuple[int, float]]]()
+    while True:
+        *lines, unfinished = (unfinished + file.read()).split('\n')
         for line in lines:
             topic, stamp, value = line.split(',')
-            self._heard.setdefault(topic, []).append((int(stamp), float(value)))
-        if len(self._heard.get(topics.PLANT_OUTPUT, ())) < FEWEST_MESSAGES:
-            return None
-        with suppress(RecordError):
-            return replace(from_messages({topic: as_messages(pairs) for topic, pairs in
-                                          self._heard.items()}, self._period), source='the motion')
-        return None
-
-
-class _GivenUpError(Exception):
-    """Nobody asks for the estimate any more."""
+            heard.setdefault(topic, []).append((int(stamp), float(value)))
+        record = None
+        if len(heard.get(topics.PLANT_OUTPUT, ())) >= FEWEST_MESSAGES:
+            with suppress(RecordError):
+                messages = {topic: as_messages(pairs) for topic, pairs in heard.items()}
+                record = replace(from_messages(messages, period), source='the motion')
+        yield record
 
 
 def _follow(
-    child: subprocess.Popen[bytes], messages: _Messages, options: argparse.Namespace,
+    child: subprocess.Popen[bytes], records: Iterator[Record | None], options: argparse.Namespace,
     stop: StopRequests,
 ) -> None:
-    """Show progress until the motion ends, is precise enough, or is to be stopped.
-
-    What the record says is looked for beside the motion, by a thread that gives way to the driver.
-    """
-    next_look, said = 3.0, ''  # [s] of motion before an estimate
-    given_up = threading.Event()
-
-    def look(record: Record) -> Identification | None:
-        with suppress(_GivenUpError, np.linalg.LinAlgError):
-            return identify_record(replace(record, commands=None), options, go_on)
-        return None
-
-    def go_on(_: str) -> None:
-        if given_up.is_set():
-            raise _GivenUpError
-
-    estimate: Future[Identification | None] | None = None
-    beside = ThreadPoolExecutor(1, initializer=partial(os.nice, 5 * (sys.platform == 'linux')))
-    with tqdm(
-        total=options.duration, file=sys.stderr, disable=None, leave=False,
-        bar_format='{desc} {percentage:3.0f} % |{bar:16}| {postfix}', desc='moving',
-    ) as bar:
-        while child.poll() is None and not stop.count:
-            time.sleep(0.25)
-            record = messages.record()
-            if record is None:
-                continue
-            moved = len(record.v) * record.sample_period
-            bar.n = min(moved, options.duration)
-            bar.set_postfix_str(said)
-            if estimate is None and moved >= next_look:
-                estimate = beside.submit(look, record)
-            if estimate is None or not estimate.done():
-                continue
-            found, estimate, next_look = estimate.result(), None, 1.5 * next_look
-            if found is None:
-                continue
-            said = _said(found)
-            line = f'{moved:5.1f} s  {said}'
-            if bar.disable:
-                print(line, file=sys.stderr, flush=True)
-            else:
-                bar.write(line, file=sys.stderr)
+    """Tell now and then what the record says, until the motion ends, is precise enough, or is to
+    be stopped. It is identified beside the motion, by a thread that gives way to the driver."""
+    next_look = 3.0  # [s] of motion before an estimate
+    estimate: Future[Identification] | None = None
+    beside = ThreadPoolExecutor(1, initializer=partial(os.nice, 5))
+    while child.poll() is None and not stop.count:
+        time.sleep(0.25)
+        record = next(records)
+        moved = len(record.v) * record.sample_period if record else 0.0
+        if record and estimate is None and moved >= next_look:
+            estimate = beside.submit(identify_record, replace(record, commands=None), options)
+        if estimate is None or not estimate.done():
+            continue
+        finished, estimate, next_look = estimate, None, 1.5 * next_look
+        with suppress(BrokenOffError):
+            found = finished.result()
+            said = found.verdict.lines[0] if found.verdict else found.refused
+            print(f'{moved:5.1f} s  {said}', file=sys.stderr, flush=True)
             if found.usable and max(found.std['gap'], found.gap * float(
                     found.model.response_std.max())) <= options.precision * found.gap:
                 break
     # Without waiting for it: the node is to come to rest now.
-    given_up.set()
     beside.shutdown(wait=False)
-
-
-def _said(found: Identification) -> str:
-    if found.details is None:
-        return found.reasons[0]
-    return (
-        f'gap {found.gap:.4g} ± {found.std["gap"]:.1g}, c_r {found.c_r:.4g} ± '
-        f'{found.std["c_r"]:.1g}, G ± {found.model.response_std.max():.1%}'
-    )
 
 
 def _end(child: subprocess.Popen[bytes], stop: StopRequests) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from backlash_ros.core.assembly import build_controller, first_guess
 from backlash_ros.core.estimate import Estimate
-from backlash_ros.core.identification.result import Details, Identification
+from backlash_ros.core.identification.identification import Details, Identification
 from backlash_ros.core.parameters import BRINGUP, BY_NAME, PLANT, Parameters, Value
 from backlash_ros.tools.config import ANY, config_text
 
@@ -26,13 +26,12 @@ def identified_parameters(
     # Parameters of the file that the user gave which do not go on: of the simulation, of one run.
     not_taken_over = (
         'truth', 'backlash', 'output_noise_std', 'output_quantum', 'input_disturbance', 'estimates',
-        'bag', 'lockstep', 'wait_for_subscribers', 'wait_for_publishers', 'axes',
-    )
+        'bag', 'lockstep', 'wait_for_subscribers', 'wait_for_publishers', 'axes')
     wider = 3.0  # bounds of the estimates, in times of what was found
     assert found.details is not None
     reach = max(abs(found.c_r), abs(found.c_l)) + found.std['c_r']
     scale = _short(max(wider * max(found.gap, reach), 1e-9))
-    c_r, c_l = _short(found.c_r, 6), _short(found.c_l, 6)
+    c_r, c_l, g = _short(found.c_r, 6), _short(found.c_l, 6), found.model
     lag = found.actuator and found.actuator.lag
     right, left = found.actuator.wind_up if found.actuator else (0.0, 0.0)
     # Digits that the swing bears, wherever 0 of v is.
@@ -48,10 +47,8 @@ def identified_parameters(
            if not {'waveform', 'amplitude', 'frequency', 'bias', 'file'} & set(given) else {}),
         **{name: value for name, value in given.items() if not name.startswith(not_taken_over)},
         'sample_period': found.sample_period,
-        'plant.numerator': found.model.numerator,
-        'plant.denominator': found.model.denominator,
-        'plant.uncertainty': found.model.uncertainty,
-        'control.delay_samples': found.model.delay,
+        'plant.numerator': g.numerator, 'plant.denominator': g.denominator,
+        'plant.uncertainty': g.uncertainty, 'control.delay_samples': g.delay,
         # None where v is the command: whatever the given file has of it is outdated.
         'actuator.numerator': tuple(lag.numerator.tolist()) if lag else (),
         'actuator.denominator': tuple(lag.denominator.tolist()) if lag else (),
@@ -60,11 +57,11 @@ def identified_parameters(
         'estimator.initial.c_r': c_r, 'estimator.initial.c_l': c_l,
         'estimator.bounds.m': (_short(found.m / wider), _short(found.m * wider)),
         'estimator.bounds.c_r': (-scale, scale), 'estimator.bounds.c_l': (-scale, scale),
-        'estimator.output_noise_std': _short(max(found.noise.std, 1e-12)),
+        'estimator.output_noise_std': _short(max(g.noise_std, 1e-12)),
         # The simulated plant is the one that was found, so that the file can be tried out.
         'backlash.m': found.m, 'backlash.c_r': c_r, 'backlash.c_l': c_l,
-        'output_quantum': _short(found.noise.quantum, 6),
-        'output_noise_std': 0.0 if found.noise.quantum else _short(found.noise.std),
+        'output_quantum': _short(g.quantum, 6),
+        'output_noise_std': 0.0 if g.quantum else _short(g.noise_std),
         **({'estimates.file': str(estimates), 'estimates.load': True} if estimates else {}),
     }
     if 'structure' not in given:
@@ -96,8 +93,7 @@ def _reference(found: Identification, details: Details) -> dict[str, Value]:
     share = max(0.4, min(0.75 * found.gap / reach, 0.8))
     return {
         'waveform': 'sine', 'amplitude': _short(share * gain * reach), 'bias': _short(middle),
-        'frequency': _short(found.model.frequencies[0] / found.sample_period),
-    }
+        'frequency': _short(found.model.frequencies[0] / found.sample_period)}
 
 
 def _weights(found: Identification, details: Details) -> dict[str, Value]:
@@ -108,17 +104,14 @@ def _weights(found: Identification, details: Details) -> dict[str, Value]:
     if found.actuator is not None:
         gain = gain * np.abs(found.actuator.lag.response(np.exp(1j * w)))
     # Beyond a tenth of the gain at the lowest frequency motion of y takes too much of v.
-    limit = details.response.known_up_to
-    beyond = np.flatnonzero((w > limit) | (gain < 0.1 * gain[0]))
+    beyond = np.flatnonzero((w > details.response.known_up_to) | (gain < 0.1 * gain[0]))
     if not len(beyond):
         return {}
-    last = max(int(beyond[0]) - 1, 0)
-    usual = Parameters().tracking
+    last, usual = max(int(beyond[0]) - 1, 0), Parameters().tracking
     return {
         'tracking.input_weight': _short(usual.input_weight * max(gain[last] / gain[-1], 1.0)**2, 2),
         # Nearly a period of that motion.
-        'tracking.preview': min(max(round(6.0 / w[last]), usual.preview), 600),
-    }
+        'tracking.preview': min(max(round(6.0 / w[last]), usual.preview), 600)}
 
 
 def as_estimate(found: Identification, parameters: Parameters) -> Estimate:
@@ -129,50 +122,39 @@ def as_estimate(found: Identification, parameters: Parameters) -> Estimate:
     return Estimate(
         found.m, initial.c_r, initial.c_l, parameters.proportional.f,
         max(found.std['m'], 1e-6 * found.m), max(found.std['c_r'], least),
-        max(found.std['c_l'], least),
-    )
+        max(found.std['c_l'], least))
 
 
 def numbers(found: Identification) -> dict[str, Any]:
     """Content of identified.json."""
-    held_out = found.details and found.details.held_out
-    actuator = found.actuator
+    held_out, actuator = found.details and found.details.held_out, found.actuator
+    g, verdict = found.model, found.verdict
     of_all = ('usable', 'reasons', 'remarks', 'm', 'gap', 'c_r', 'c_l', 'sample_period')
-    of_model = ('numerator', 'denominator', 'integrator', 'uncertainty')
+    of_model = ('numerator', 'denominator', 'integrator', 'uncertainty', 'outliers')
     return {
         **{name: getattr(found, name) for name in of_all},
-        **{name: getattr(found.model, name) for name in of_model},
-        'outliers': found.noise.outliers,
-        'known': None if found.verdict is None else {
-            name: getattr(found.verdict, name)._asdict() for name in ('backlash', 'gain', 'model')
-        },
+        **{name: getattr(g, name) for name in of_model},
+        'known': verdict and {name: getattr(verdict, name)._asdict()
+                              for name in ('backlash', 'gain', 'model')},
         'offset': 0.5 * (found.c_r + found.c_l),
         'std': dict(found.std) or dict.fromkeys(('m', 'gap', 'c_r', 'c_l')),
-        'delay_samples': found.model.delay, 'equally_good_delays': found.model.delays,
-        'output_noise_std': found.noise.std, 'output_quantum': found.noise.quantum,
-        'response': {
-            'frequency_hz': hertz(found).tolist(),
-            'relative_std': found.model.response_std.tolist(),
-        },
+        'delay_samples': g.delay, 'equally_good_delays': g.delays,
+        'output_noise_std': g.noise_std, 'output_quantum': g.quantum,
+        'response': {'frequency_hz': found.hertz.tolist(),
+                     'relative_std': g.response_std.tolist()},
         'held_out': held_out and {'rms': held_out.rms, 'rms_of_fit': held_out.trained},
         'actuator': actuator and {
             'numerator': actuator.lag.numerator.tolist(),
-            'denominator': actuator.lag.denominator.tolist(), 'wind_up': actuator.wind_up,
-        },
+            'denominator': actuator.lag.denominator.tolist(), 'wind_up': actuator.wind_up},
         'samples': len(found.y), 'lost_samples': int(np.isnan(found.y).sum()),
     }
-
-
-def hertz(found: Identification) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Frequencies at which the deviation of G is told [Hz]."""
-    return np.asarray(found.model.frequencies / (2.0 * np.pi * found.sample_period))
 
 
 def commented_yaml(
     parameters: Parameters, found: Identification, source: str, axis: str = '',
 ) -> str:
     """A parameter file that says of each value what it is and, where it was found, how surely."""
-    band, std = hertz(found), found.std
+    band, std = found.hertz, found.std
     comments = {
         'plant.numerator': f'G to ± {100.0 * found.model.response_std.max():.2g} % from '
                            f'{band[0]:.2g} to {band[-1]:.2g} Hz; its gain is that for m = '
@@ -185,8 +167,7 @@ def commented_yaml(
     lines = [
         f'# Identified from {source}: {len(found.y)} samples of {found.sample_period:g} s.',
         f'# {"; ".join(found.remarks)}.' if found.remarks else '# Nothing spoke against it.',
-        '# Values with ± were found, the others are as they were given, or defaults.',
-    ]
+        '# Values with ± were found, the others are as they were given, or defaults.']
     path: list[str] = []
     for line in config_text(parameters).splitlines():
         path[(len(line) - len(line.lstrip())) // 2:] = [line.split(':')[0].strip()]

@@ -2,40 +2,22 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
-from numpy.typing import NDArray
 
-from backlash_ros.core.identification.deviations import autocorrelation
-from backlash_ros.core.identification.result import Details, Identification
-from backlash_ros.tools.figures import (
-    HUES,
-    TIME_LABEL,
-    band,
-    curve,
-    label,
-    legend_above,
-    limits,
-    zero_line,
-)
-from backlash_ros.tools.identify.identified_file import hertz
+from backlash_ros.core.identification.identification import Details, Identification
+from backlash_ros.core.identification.model import autocorrelation
+from backlash_ros.tools import figures
+from backlash_ros.tools.figures import HUES, TIME_LABEL, curve, label
 from backlash_ros.tools.page import Picture
-
-Array = NDArray[np.float64]
 
 BAND_STDS = 2.0  # standard deviations that bands reach
 
 
 def pictures(found: Identification) -> Iterator[Picture]:
     """Every picture, in the order of the page; none where nothing was fitted."""
-    details = found.details
-    if details is None:
-        return
     for name, heading, caption, height, draw in (
         ('held_out.png', 'Measured and simulated y on samples that were held out',
          'Simulated from v alone, with a model that was fitted to the samples before: the lines '
@@ -54,15 +36,13 @@ def pictures(found: Identification) -> Iterator[Picture]:
          'How much and how late y answers to u, with a band of two standard deviations. Between '
          'the dotted lines y moved; outside of them the record says little.', 5.6, _bode),
     ):
-        figure = Figure(figsize=(10.0, height), constrained_layout=False)
-        # Margins that suit all of them: a layout takes as long as to draw it.
-        figure.subplots_adjust(left=0.1, right=0.985, bottom=0.55 / height,
-                               top=1.0 - 0.4 / height, wspace=0.2, hspace=0.4)
-        draw(figure, found, details)
-        buffer = io.BytesIO()
-        # Quickly rather than small.
-        FigureCanvasAgg(figure).print_png(buffer, pil_kwargs={'compress_level': 1})
-        yield Picture(name, heading, caption, buffer.getvalue())
+        if found.details is not None:
+            figure = Figure(figsize=(10.0, height), constrained_layout=False)
+            # Margins that suit all of them: a layout takes as long as to draw it.
+            figure.subplots_adjust(left=0.1, right=0.985, bottom=0.55 / height,
+                                   top=1.0 - 0.4 / height, wspace=0.2, hspace=0.4)
+            draw(figure, found, found.details)
+            yield Picture(name, heading, caption, figures.png(figure))
 
 
 def _held_out(figure: Figure, found: Identification, details: Details) -> None:
@@ -71,73 +51,66 @@ def _held_out(figure: Figure, found: Identification, details: Details) -> None:
     t = found.sample_period * np.arange(first, first + len(simulated), dtype=float)
     curve(upper, t, y, HUES['y'], 'measured', width=2.2)
     curve(upper, t, simulated, HUES['u_d'], 'simulated', '--')
-    legend_above(upper)
+    figures.legend_above(upper)
     curve(lower, t, y - simulated, HUES['e'])
-    zero_line(lower)
+    figures.zero_line(lower)
     share = 1.0 - rms / max(float(np.nanstd(y)), 1e-300)
     label(upper, f'{share:.2%} of the motion is predicted', 'y')
     label(lower, '', 'difference', TIME_LABEL)
 
 
 def _loop(figure: Figure, found: Identification, details: Details) -> None:
-    loop_points = 4000  # samples that the curves over v show
+    newest = slice(-4000, None)  # samples that the curves over v show
     left, right = figure.subplots(1, 2)
-    v = details.v[-loop_points:]
-    curve(left, v, details.y[-loop_points:], HUES['y'], width=0.8)
+    v, o = details.v[newest], details.observed
+    curve(left, v, o.y[newest], HUES['y'], width=0.8)
     label(left, 'As measured', 'y', 'v')
-    curve(right, v, v - details.p[-loop_points:] + found.c_r, HUES['u'], width=0.8)
+    curve(right, v, v - o.p[newest] + found.c_r, HUES['u'], width=0.8)
     for name, value in (('c_r', found.c_r), ('c_l', found.c_l)):
         right.axhline(value, color=HUES[name], linewidth=4.0, alpha=0.5,
                       label=f'${name}$ = {value:.4g}')
     label(right, 'As found', 'v − u / m', 'v')
-    legend_above(right)
+    figures.legend_above(right)
 
 
 def _residual(figure: Figure, found: Identification, details: Details) -> None:
     grid = figure.add_gridspec(2, 2)
     over_time = figure.add_subplot(grid[0, :])
     correlated, over_v = figure.add_subplot(grid[1, 0]), figure.add_subplot(grid[1, 1])
-    residual, v = details.y - details.simulated, details.v
+    residual = details.observed.residual
     t = found.sample_period * (details.first + np.arange(len(residual), dtype=float))
     curve(over_time, t, residual, HUES['e'], width=0.8)
-    label(over_time, f'Deviation {found.noise.std:.3g}', 'residual', TIME_LABEL)
+    label(over_time, f'Deviation {found.model.noise_std:.3g}', 'residual', TIME_LABEL)
     bound = BAND_STDS / np.sqrt(np.isfinite(residual).sum())
     r = autocorrelation(residual, 60)[1:]
     correlated.axhspan(-bound, bound, color='#bbbbbb', alpha=0.5, linewidth=0)
     correlated.vlines(np.arange(1, len(r) + 1), 0.0, r, color=HUES['e'], linewidth=1.5)
-    correlated.set_ylim(*limits([np.append(r, [-3.0 * bound, 3.0 * bound])], 0.1))
+    correlated.set_ylim(*figures.limits([np.append(r, [-3.0 * bound, 3.0 * bound])], 0.1))
     label(correlated, 'Autocorrelation', '', 'lag [samples]')
-    over_v.plot(v, residual, '.', color=HUES['e'], markersize=2, alpha=0.4, rasterized=True)
-    known = np.isfinite(residual)
-    edges = np.linspace(v.min(), v.max(), 26)
-    counts = np.histogram(v[known], edges)[0]
-    sums = np.histogram(v[known], edges, weights=residual[known])[0]
-    means = np.where(counts > 3, sums / np.maximum(counts, 1), np.nan)
-    curve(over_v, 0.5 * (edges[1:] + edges[:-1]), means, HUES['u'], width=1.6)
-    label(over_v, 'Over v, with its mean', '', 'v')
+    over_v.plot(details.v, residual, '.', color=HUES['e'], markersize=2, alpha=0.4,
+                rasterized=True)
+    label(over_v, 'Over v', '', 'v')
     for axes in (over_time, correlated, over_v):
-        zero_line(axes)
+        figures.zero_line(axes)
 
 
 def _bode(figure: Figure, found: Identification, details: Details) -> None:
-    rooms = figure.subplots(2, 1, sharex=True)
+    magnitude, phase = figure.subplots(2, 1, sharex=True)
     w = np.geomspace(max(found.model.frequencies[0] / 5.0, 1e-5), 0.98 * np.pi, 400)
     value = details.response.at(w) * np.exp(-1j * w * found.model.delay)
     spread = BAND_STDS * details.response.std(w)
-    f, size, phase = w / (2.0 * np.pi * found.sample_period), np.abs(value), np.degrees(
-        np.unwrap(np.angle(value)))
+    size, angle = np.abs(value), np.degrees(np.unwrap(np.angle(value)))
     turn = np.degrees(np.arcsin(np.minimum(spread, 1.0)))
     for axes, middle, low, high, name, unit in (
-        (rooms[0], size, size * np.maximum(1.0 - spread, 1e-3), size * (1.0 + spread),
+        (magnitude, size, size * np.maximum(1.0 - spread, 1e-3), size * (1.0 + spread),
          'Magnitude', '|m G| [y/v]'),
-        (rooms[1], phase, phase - turn, phase + turn, 'Phase', 'degrees'),
+        (phase, angle, angle - turn, angle + turn, 'Phase', 'degrees'),
     ):
-        band(axes, f, low, high, HUES['m'])
+        f = w / (2.0 * np.pi * found.sample_period)
+        figures.band(axes, f, low, high, HUES['m'])
         curve(axes, f, middle, HUES['m'])
-        for edge in hertz(found)[[0, -1]]:
+        for edge in found.hertz[[0, -1]]:
             axes.axvline(edge, color='#444444', linestyle=':', linewidth=1.0)
         label(axes, name, unit)
-    label(rooms[1], x='frequency [Hz]')
-    rooms[0].set(xscale='log', yscale='log', ylim=(size.min() / 3.0, size.max() * 3.0))
-    for axis in (rooms[0].xaxis, rooms[0].yaxis, rooms[1].xaxis):
-        axis.set_minor_formatter(NullFormatter())
+    label(phase, x='frequency [Hz]')
+    magnitude.set(xscale='log', yscale='log', ylim=(size.min() / 3.0, size.max() * 3.0))

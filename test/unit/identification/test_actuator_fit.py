@@ -10,9 +10,9 @@ import pytest
 
 from backlash_ros.core import Parameters, build_plant
 from backlash_ros.core.identification.actuator import with_actuator
-from backlash_ros.core.identification.identification import identify
+from backlash_ros.core.identification.identification import Identification, identify
 from backlash_ros.core.identification.motion import strokes
-from backlash_ros.core.identification.result import Identification, Options
+from backlash_ros.core.identification.structure_search import Options
 from backlash_ros.core.records.record import Record
 from backlash_ros.tools.identify.identified_file import commented_yaml, identified_parameters
 from backlash_ros.tools.identify.outcome import write_record

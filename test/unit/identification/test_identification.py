@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from backlash_ros.core.identification.identification import identify
+from backlash_ros.core.identification.identification import Identification, identify
+from backlash_ros.core.identification.model import Samples, Structure, first_model, fitted
 from backlash_ros.core.identification.motion import strokes
-from backlash_ros.core.identification.result import Identification, Options
-from backlash_ros.core.identification.structure import Samples, Structure, first_model, fitted
+from backlash_ros.core.identification.structure_search import Options
 from backlash_ros.core.plant.backlash import play
 
 Array = NDArray[np.float64]
@@ -82,7 +82,7 @@ def test_lost_samples_and_outliers_do_not_matter() -> None:
     wild = rng.choice(np.flatnonzero(np.isfinite(y)), 12, replace=False)
     y[wild] += 5.0
     found = identify(v, y, PERIOD_S, QUICK)
-    assert 12 <= found.noise.outliers <= 40
+    assert 12 <= found.model.outliers <= 40
     assert found.gap == pytest.approx(0.9, abs=4.0 * found.std['gap'])
     assert found.model.delay == 1
     assert found.model.denominator == pytest.approx((1.0, -1.7, 0.755), abs=0.01)
@@ -94,7 +94,7 @@ def test_readings_that_come_twice_make_no_gap_wider() -> None:
     for k in again:
         y[k] = y[k - 1]
     found = identify(v, y, PERIOD_S, QUICK)
-    assert found.noise.outliers > 0.6 * len(again)
+    assert found.model.outliers > 0.6 * len(again)
     assert abs(found.gap - 0.9) < 2.5 * found.std['gap'] < 0.01
 
 

@@ -8,8 +8,13 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from backlash_ros.core.identification.linear_family import LinearFamily, Observed
-from backlash_ros.core.identification.not_play import BESIDE_V, LEFT_OVER, best_other, what_it_is
+from backlash_ros.core.identification.not_play import (
+    BESIDE_V,
+    LinearFamily,
+    Observed,
+    best_other,
+    what_it_is,
+)
 
 Array = NDArray[np.float64]
 
@@ -37,15 +42,6 @@ def play(v: Array, gap: Array | float) -> Array:
 
 def dead_zone(v: Array) -> Array:
     return np.asarray(np.sign(v) * np.maximum(np.abs(v) - 0.4, 0.0))
-
-
-def sticking(v: Array, band: float = 0.9, jump: float = 0.4) -> Array:
-    place, out = float(v[0]), []
-    for value in v.tolist():
-        if abs(value - place) > 0.5 * (band + jump):
-            place = value - np.sign(value - place) * 0.5 * (band - jump)
-        out.append(place)
-    return np.array(out)
 
 
 def behind(u: Array, plant: str, noise: float = NOISE) -> Array:
@@ -111,10 +107,6 @@ def test_a_stick_band_behind_each_turn_is_named_with_its_jump() -> None:
     assert (band, jump) == pytest.approx((0.8, 0.3), abs=0.01)
 
 
-def test_stick_and_slip_is_named() -> None:
-    assert 'y sticks and slips' in named(observed(V, behind(sticking(V), 'gain'), 0.9))
-
-
 @pytest.mark.parametrize(('plant', 'gap', 'noise'), [
     *((plant, GAP, NOISE) for plant in PLANTS), ('gain', 0.05, NOISE), ('lag', 0.0, NOISE),
     ('two lags', GAP, 0.05), ('integrator', 0.05, NOISE), ('resonance', 0.0, NOISE),
@@ -123,7 +115,7 @@ def test_a_play_is_nothing_else(plant: str, gap: float, noise: float) -> None:
     o = observed(V, behind(play(V, gap), plant, noise), gap, noise)
     assert what_it_is(o) is None
     # Not even where the residual asks for it.
-    assert not any(test(o) for test, _ in (*BESIDE_V, *LEFT_OVER))
+    assert not any(test(o) for test, _ in BESIDE_V)
     assert best_other(o) is None
 
 

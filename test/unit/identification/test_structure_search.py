@@ -8,19 +8,20 @@ import pytest
 from scipy.signal import lfilter
 
 from backlash_ros.core.estimation.posterior import WindowFit
-from backlash_ros.core.identification.deviations import by_model, covariance_of
 from backlash_ros.core.identification.identification import identify
-from backlash_ros.core.identification.motion import strokes
-from backlash_ros.core.identification.result import Options
-from backlash_ros.core.identification.structure import (
+from backlash_ros.core.identification.model import (
     Model,
     Samples,
     Structure,
+    by_model,
+    covariance_of,
     first_model,
     fitted,
 )
+from backlash_ros.core.identification.motion import strokes
 from backlash_ros.core.identification.structure_search import (
     Compared,
+    Options,
     cancelled_poles,
     gives_way,
     selected,

@@ -16,7 +16,7 @@ WANDER = 0.0155 * lfilter([1.0], [1.0, -0.95], np.random.default_rng(8).standard
 SAW = 0.02 * np.abs(np.arange(3000) % 400 - 200.0)
 FOUND = Findings(
     GOOD, gap_std=0.01, apart=0.0, c_r_std=0.01, gain=0.8, gain_std=0.01, response_std=0.02,
-    evidence=1e3, later=1.0, rivals=(), open_delay=0,
+    evidence=1e3, rivals=(), open_delay=0,
 )
 
 
@@ -140,7 +140,6 @@ def test_a_gap_that_changes_is_told_with_its_values_and_widens_the_deviation() -
 @pytest.mark.parametrize(('changed', 'said'), [
     ({'gain': -0.8}, 'the gain of G is negative'),
     ({'open_delay': 3}, 'try --delay 3-10'),
-    ({'later': 20.0, 'observed': replace(GOOD, noise=1e-4)}, '20 times worse'),
     ({'observed': observed(SAW, behind(play(SAW, GAP), 'lag'))}, 'one speed only'),
 ])
 def test_what_to_know_is_remarked(changed: dict[str, Any], said: str) -> None:

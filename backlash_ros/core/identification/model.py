@@ -1,0 +1,393 @@
+"""All plants of one structure, their fit to a record, and what deviations it has.
+
+    G = z^-(1+delay) B / A,   xi = (B, a) without any prior worth mentioning;   m = 1 is in B
+
+fitted by the Gauss-Newton steps of the loop to a record that is centred and scaled first, so that
+neither an offset nor a unit takes digits. Of residuals that are correlated from sample to sample,
+
+    C = H^-1 (J' R J) H^-1,   H = J'J + what is known beside the samples
+
+with normalised rows J and the Toeplitz matrix R of the residual's autocovariance, tapered to zero
+beyond those lags over which it lasts. No variance is less than that of white noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import inf, log, nan, sqrt
+from typing import NamedTuple
+
+import numpy as np
+from numpy.polynomial.polynomial import polyval
+from numpy.typing import NDArray
+
+from backlash_ros.core.estimation.fit import STEPS, Problem, Run
+from backlash_ros.core.estimation.plant_family import delayed, padded, state_columns
+from backlash_ros.core.estimation.posterior import Prior, WindowFit
+from backlash_ros.core.plant.backlash import play
+from backlash_ros.core.plant.numerics import lfilter
+
+Array = NDArray[np.float64]
+
+VAGUE = 1e3  # prior deviation of a coefficient, in scaled units
+TINY = float(np.finfo(float).tiny)
+GRID: Array = np.pi * (np.arange(40) + 0.5) / 40  # frequencies [rad/sample]
+SILENT = 0.1  # relative deviation, or difference, of G beyond which the record is silent
+
+
+@dataclass(frozen=True)
+class Structure:
+    """A family of plants: number of poles, of which one may be an integrator; samples of v before
+    it acts, less one; coefficients of B, where 0 as many as poles, one of G that is a gain."""
+
+    order: int
+    delay: int
+    integrator: bool
+    taps: int = 0
+
+    @property
+    def free_poles(self) -> int:
+        return self.order - self.integrator
+
+    @property
+    def numerator_taps(self) -> int:
+        return self.taps or max(self.order, 1)
+
+    @property
+    def states(self) -> int:
+        """Numbers of the state before a record."""
+        return max(self.order, self.numerator_taps - 1)
+
+    @property
+    def unknowns(self) -> int:
+        """Numbers that are fitted, with the gap, the start, the offset and the state."""
+        return self.count + self.states + 3
+
+    @property
+    def count(self) -> int:
+        return self.numerator_taps + self.free_poles
+
+    @property
+    def leaks(self) -> int:
+        return self.count  # all have priors of their own
+
+    def at(self, xi: list[float]) -> tuple[list[float], list[float]]:
+        """B and A of one length; no numbers where a pole lies outside of the unit circle."""
+        values = [VAGUE * x for x in xi]
+        b, a = values[:self.numerator_taps], [1.0, *values[self.numerator_taps:]]
+        if not (np.isfinite(a).all() and np.abs(np.roots(a)).max(initial=0.0) < 1.0):
+            a = [nan] * len(a)
+        if self.integrator:
+            a = [one - before for one, before in zip([*a, 0.0], [0.0, *a], strict=True)]
+        return b + [0.0] * (self.states + 1 - len(b)), a + [0.0] * (self.states + 1 - len(a))
+
+    def slopes(self, _: list[float]) -> tuple[Array, Array]:
+        """Derivatives of B and A by each of xi, the same everywhere."""
+        taps, poles = self.numerator_taps, self.free_poles
+        of_b, of_a = np.zeros((2, self.count, self.states + 1))
+        of_b[:taps, :taps] = VAGUE * np.eye(taps)
+        of_a[taps:, 1:poles + 1] = VAGUE * np.eye(poles)
+        if self.integrator:
+            of_a[taps:, 2:poles + 2] -= VAGUE * np.eye(poles)
+        return of_b, of_a
+
+    def xi(self, numerator: Array, a: Array) -> Array:
+        """xi of B and the free coefficients of A behind the leading 1; missing taps are 0."""
+        return np.append(padded(numerator, self.numerator_taps), a) / VAGUE
+
+
+@dataclass(frozen=True)
+class Samples:
+    """A record (N,), centred and scaled, y nan where lost; [first, last): the y that are fitted.
+    step: of the readings where rounding is most of what a fit leaves, so that repeated ones repeat
+    one error; else 0."""
+
+    v: Array
+    y: Array
+    first: int
+    last: int
+    step: float
+
+    @property
+    def fitted_y(self) -> Array:
+        return self.y[self.first:self.last]
+
+    def problem(self, structure: Structure) -> Problem:
+        held = 1e6  # weight of m = 1, which is in B
+        begin, y = self.first - 1 - structure.delay, self.fitted_y
+        prior = Prior(held * np.eye(1, 3 + structure.count), np.full(1, held))
+        return Problem(structure, self.v[begin:begin + len(y)], y, 1e-12, prior, step=self.step)
+
+
+@dataclass(frozen=True)
+class Model:
+    """A structure with the values that fit best, all in scaled units."""
+
+    structure: Structure
+    problem: Problem
+    fit: WindowFit
+
+    @cached_property
+    def run(self) -> Run:
+        """y, and the play output p as it acts on it, at every sample."""
+        return self.problem.at(self.fit)
+
+    @cached_property
+    def left(self) -> Array:
+        """The residual where y is known (R,)."""
+        return np.asarray(self.run.error[self.problem.known])
+
+    @property
+    def squares(self) -> float:
+        """Of the residual; inf where they are no number."""
+        squares = float(self.left @ self.left)
+        return squares if np.isfinite(squares) else inf
+
+    def behind(self, best: Model, rows: float) -> float:
+        """Twice the log-likelihood by which it explains less, of so many independent readings."""
+        return rows * log(max(self.squares, TINY) / max(best.squares, TINY))
+
+    @property
+    def rms(self) -> float:
+        return sqrt(self.squares / max(len(self.left), 1))
+
+    @property
+    def gap(self) -> float:
+        return self.fit.gap
+
+    @property
+    def numerator(self) -> Array:
+        """B."""
+        return np.array(self.structure.at(self.fit.xi)[0][:self.structure.numerator_taps])
+
+    @property
+    def a(self) -> Array:
+        """Free coefficients of A behind the leading 1."""
+        return np.asarray(VAGUE * self.fit.theta[3 + self.structure.numerator_taps:])
+
+    @property
+    def denominator(self) -> Array:
+        """A, with the integrator."""
+        return np.array(self.structure.at(self.fit.xi)[1][:self.structure.order + 1])
+
+
+def fitted(
+    samples: Samples, structure: Structure, begin: WindowFit, steps: int = STEPS,
+) -> Model:
+    """The best values nearest to some."""
+    problem = samples.problem(structure)
+    # As much noise as there is motion hides nothing from the first step.
+    begin = replace(begin, step=0.0, noise_std=max(begin.noise_std, 1e-12))
+    with suppress(np.linalg.LinAlgError):  # what has no finite posterior stays as it began
+        begin = problem.fitted(begin, steps)
+    return Model(structure, problem, begin)
+
+
+def moved_to(
+    structure: Structure, like: Model, gap: float | None = None, p0: float | None = None,
+    factor: Sequence[float] = (1.0,),
+) -> WindowFit:
+    """What a fit of a structure may begin with, from a model; factor: (1, -pole) for a structure
+    with a pole more, which a zero cancels."""
+    fit, (m, offset, width) = like.fit, like.fit.theta[:3].tolist()
+    b, a = (np.asarray(np.convolve(one, factor), dtype=float)
+            for one in (like.numerator, np.append(1.0, like.a)))
+    begin = np.append([m, offset, width if gap is None else gap], structure.xi(b, a[1:]))
+    return WindowFit(np.zeros(1), fit.p0 if p0 is None else p0, begin, fit.noise_std)
+
+
+def first_model(
+    samples: Samples, structure: Structure, gap: float, p0: float,
+    filters: Sequence[float] = (0.6, 0.95),
+) -> Model:
+    """The best model by Steiglitz and McBride for a play of this gap and beginning: least squares
+    in A and B, all filtered by 1/A of the step before; filters: poles of the first ones."""
+    inside = 0.999  # where poles outside of the unit circle are put
+    problem, taps, poles = samples.problem(structure), structure.numerator_taps, \
+        structure.free_poles
+    known, count = problem.known, len(problem.v)
+    moves = np.vstack([play(problem.v, gap, p0), np.ones(count)])
+    y = np.interp(np.arange(count), np.flatnonzero(known), problem.y[known])
+    found = []
+    for pole in filters if poles else filters[:1]:
+        a: Array = np.atleast_1d(np.poly([pole] * poles))
+        for _ in range(3 if poles else 1):
+            # A y over A: with an integrator in both, 1 - 1/z cancels.
+            back = lfilter([1.0], a, y)
+            whole = np.asarray(np.convolve(a, (1.0, -1.0))) if structure.integrator else a
+            moved, constant = lfilter([1.0], whole, moves)
+            columns = np.vstack([
+                delayed(moved, taps), -delayed(back, poles + 1)[1:], constant,
+                state_columns(padded(whole, structure.states + 1).tolist(), count).T, back])
+            r = np.asarray(np.linalg.qr(columns[:, known].T, mode='r'))
+            solution = np.linalg.lstsq(r[:, :-1], r[:, -1], rcond=1e-13)[0]
+            a = np.append(1.0, solution[taps:taps + poles])
+            roots = np.roots(a)
+            size = np.abs(roots)
+            if size.max(initial=0.0) > inside:
+                a = np.real(np.poly(roots * np.minimum(inside / np.maximum(size, inside), 1.0)))
+        b, gain = solution[:taps], float(solution[:taps].sum())
+        offset = -float(solution[taps + poles]) / gain if gain else 0.0
+        theta = np.concatenate([[1.0, offset, gap], structure.xi(b, a[1:])])
+        fit = WindowFit(solution[len(solution) - structure.states:], p0, theta, 1.0)
+        found.append(Model(structure, problem, fit))
+    return min(found, key=lambda model: model.squares)
+
+
+# --- residuals and deviations ---------------------------------------------------------------------
+
+
+def autocorrelation(residual: Array, lags: int) -> Array:
+    """Of a residual with nan where it is not known, lags 0 to `lags`; 1 first."""
+    known, size = np.isfinite(residual), len(residual)
+    products, pairs = (_convolved(x, x[::-1])[size - 1:size + lags]
+                       for x in (np.where(known, residual, 0.0), known.astype(float)))
+    covariance = products / np.maximum(np.round(pairs), 1.0)
+    return np.asarray(covariance / covariance[0]) if covariance[0] > 0.0 else np.eye(lags + 1)[0]
+
+
+def _convolved(a: Array, b: Array) -> Array:
+    """The whole convolution along the first axis; that of SciPy costs a start of 0.3 s."""
+    count = len(a) + len(b) - 1
+    size = 2 ** (count - 1).bit_length()
+    product = np.fft.rfft(a, size, axis=0) * np.fft.rfft(b, size, axis=0)
+    return np.asarray(np.fft.irfft(product, size, axis=0)[:count])
+
+
+def covariance_of(problem: Problem, f: WindowFit) -> Array:
+    """Covariance of theta, shape (3 + K, 3 + K)."""
+    columns, count = problem.rows(f)[:, :-1], len(problem.v)
+    residual = np.where(problem.known, problem.normalised(f), np.nan)
+    columns[:count][~problem.known] = 0.0
+    size = np.sqrt(np.einsum('ij,ij->j', columns, columns))
+    size[size == 0.0] = np.inf  # what no sample depends on
+    q, upper = np.linalg.qr(columns / size)
+    rows = int(problem.known.sum())
+    variance = float(np.nansum(residual**2)) / max(rows - columns.shape[1], 1)
+    # As many as the correlation lasts (D. W. K. Andrews, Econometrica 59 (1991) 817-858).
+    r = lag_one(residual[problem.known])
+    lasts = 1.1447 * (4.0 * r**2 / (1.0 - r**2) ** 2 * rows) ** (1.0 / 3.0)
+    lags = max(round(max(sqrt(rows), min(lasts, 0.25 * rows))), 1)
+    taper = autocorrelation(residual, lags) * (1.0 - np.arange(lags + 1) / (lags + 1.0))
+    q[~np.append(problem.known, np.zeros(len(q) - count, dtype=bool))] = 0.0
+    middle = q[:count].T @ _convolved(
+        q[:count], np.append(taper[:0:-1], taper)[:, None])[lags:lags + count]
+    values, vectors = np.linalg.eigh(0.5 * (middle + middle.T))
+    root = np.linalg.pinv(upper, rcond=1e-12) @ vectors \
+        * np.sqrt(variance * np.maximum(values, 1.0)) / size[:, None]
+    matrix, at = root @ root.T, len(root) - len(f.theta)
+    return np.asarray(matrix[at:, at:])
+
+
+def by_model(gap: float, others: Iterable[tuple[float, float]]) -> float:
+    """Deviation of a gap by other models (gap, twice the log-likelihood by which it falls behind):
+    as of a profile likelihood, by the steepest one."""
+    return max((abs(other - gap) / sqrt(max(behind, 1.0))
+                for other, behind in others if behind <= 4.0), default=0.0)
+
+
+def effective(residual: Array) -> float:
+    """How many independent ones residuals (R,) count as; nan counts as none."""
+    r = lag_one(residual)
+    return np.count_nonzero(np.isfinite(residual)) * (1.0 - r) / (1.0 + r)
+
+
+def lag_one(residual: Array, certain: bool = False) -> float:
+    """Correlation of successive residuals (R,) but for nan, at least 0; certain: beyond chance."""
+    residual = residual[np.isfinite(residual)]
+    energy = float(residual @ residual)
+    if energy == 0.0 or not np.isfinite(energy):
+        return 0.0
+    chance = 3.0 / sqrt(len(residual)) if certain else 0.0
+    return min(max(float(residual[1:] @ residual[:-1]) / energy - chance, 0.0), 0.99)
+
+
+class Response(NamedTuple):
+    """m G without its delay; covariance: of B and a. denominator: 1, a; times 1 - 1/z where G is
+    an integrator."""
+
+    numerator: Array
+    denominator: Array
+    integrator: bool
+    covariance: Array
+
+    def at(self, frequencies: Array) -> NDArray[np.complex128]:
+        """At frequencies [rad/sample]."""
+        back = np.exp(-1j * np.asarray(frequencies))
+        value = back * polyval(back, self.numerator) / polyval(back, self.denominator)
+        return np.asarray(value / (1.0 - back) if self.integrator else value)
+
+    def std(self, frequencies: Array) -> Array:
+        """Relative deviation at frequencies [rad/sample], shape (N,)."""
+        back = np.exp(-1j * np.asarray(frequencies, dtype=float))
+        free, top = polyval(back, self.denominator), polyval(back, self.numerator)
+        # d log(mG): z^-i / B for b_i, -z^-j / A for a_j.
+        jacobian = np.array([
+            *(back**i / top for i in range(len(self.numerator))),
+            *(-back**j / free for j in range(1, len(self.denominator)))]).T
+        variance = np.einsum('ni,ij,nj->n', jacobian, self.covariance, jacobian.conj()).real
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+    @property
+    def known_up_to(self) -> float:
+        """Frequency [rad/sample] from which on G is not known; pi where it is throughout."""
+        known = np.flatnonzero(self.std(GRID) <= SILENT)
+        return float(GRID[known[-1]]) if len(known) else float(GRID[0])
+
+
+def response_of(found: Model, covariance: Array | None = None, unit: float = 1.0) -> Response:
+    """Of a model, with the covariance of its theta; unit: of y over that of v."""
+    if covariance is None:
+        covariance = np.zeros((3 + found.structure.count,) * 2)
+    scale = np.append(np.full(found.structure.numerator_taps, unit * VAGUE),
+                      np.full(found.structure.free_poles, VAGUE))
+    return Response(unit * found.numerator, np.append(1.0, found.a), found.structure.integrator,
+                    covariance[3:, 3:] * np.outer(scale, scale))
+
+
+def least_response(best: Model, rivals: Sequence[Model] = ()) -> Model:
+    """The model to take, of those with other delays that fit alike.
+
+    High frequencies that v hardly had leave zeros and delay of G open, and a fast controller would
+    act on whatever noise puts there. Within two standard deviations of each fit, the model is taken
+    whose |G|^2 is least where G is not known, or where those delays contradict each other: sampled
+    plants that are driven through a hold have little gain there.
+    """
+    if best.structure.numerator_taps < 2:
+        return best  # a gain is the same at every frequency
+    own = response_of(best, covariance_of(best.problem, best.fit))
+    silent = own.known_up_to < GRID
+    if not silent.any():
+        for one in rivals:
+            later = np.exp(-1j * GRID * (one.structure.delay - best.structure.delay))
+            other = response_of(one)
+            silent |= np.abs(other.at(GRID) * later / own.at(GRID) - 1.0) > SILENT
+    if not silent.any():
+        return best
+    smooth = [_smoothed(one, GRID[silent], best.squares / effective(best.left))
+              for one in (best, *rivals)]
+    return min(smooth, key=lambda one: float(
+        np.sum(np.abs(response_of(one).at(GRID[silent])) ** 2)))
+
+
+def _smoothed(found: Model, silent: Array, noise_variance: float) -> Model:
+    """With the heaviest weight on these gains that stays within two deviations."""
+    covariance, taps = covariance_of(found.problem, found.fit), found.structure.numerator_taps
+    # Their product with B is G at these frequencies, real and imaginary parts.
+    back = np.exp(-1j * silent)
+    of_b = back[:, None] ** np.arange(taps) / np.abs(polyval(back, found.denominator))[:, None]
+    rows = np.zeros((2 * len(silent), len(covariance)))
+    rows[:, 3:3 + taps] = VAGUE * np.vstack([of_b.real, of_b.imag])
+    pull = covariance @ rows.T @ rows
+    for weight in 1e6 / max(float(np.trace(pull)), 1e-300) * 0.0625 ** np.arange(12.0):
+        theta = np.linalg.solve(np.eye(len(pull)) + weight * pull, found.fit.theta)
+        fit = replace(found.fit, theta=theta)
+        if not np.isfinite(found.structure.at(fit.xi)[1]).all():
+            continue  # a pole has left the unit circle
+        smooth = Model(found.structure, found.problem, found.problem.begun(fit))
+        if smooth.squares <= found.squares + 4.0 * noise_variance:
+            return smooth
+    return found
