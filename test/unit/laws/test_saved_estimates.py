@@ -63,9 +63,7 @@ def test_estimates_of_another_plant_or_law_are_refused(tmp_path, name, value):
 @pytest.mark.parametrize(('std', 'reason'), [
     (0.01, ''), (None, ''), (0.0, 'holds constants that were given'),
 ])
-def test_constants_that_were_learned_serve_the_law_that_learns_none(
-    tmp_path: Path, std: float | None, reason: str,
-) -> None:
+def test_constants_that_were_learned_serve_the_law_that_learns_none(tmp_path, std, reason):
     file = tmp_path / 'estimates.json'
     deviation = nan if std is None else std
     learned = replace(LEARNED, std_m=deviation, std_c_r=deviation, std_c_l=deviation)

@@ -7,14 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from backlash_ros.core.loop.command_history import (
-    CONSISTENT,
-    CommandHistory,
-    HeldControl,
-    ReportOrigin,
-    report_use,
-    v_of_intervals,
-)
+from backlash_ros.core.loop import command_history
 from backlash_ros.core.loop.sample_counter import UNNUMBERED, Arrival, SampleCounter
 from backlash_ros.core.parameters import Parameters
 
@@ -58,14 +51,14 @@ def test_a_gap_in_the_numbers_counts_though_messages_come_in_a_burst(gaps: list[
 
 
 def over(
-    commands: CommandHistory, intervals: int, end: float, due: float | None = None,
+    commands: command_history.CommandHistory, intervals: int, end: float, due: float | None = None,
 ) -> list[float]:
     end_ns, due_ns = (START_NS + int(t * PERIOD_NS) for t in (end, end if due is None else due))
     return commands.over(intervals, end_ns, due_ns)[0]
 
 
 def test_a_late_command_leaves_the_older_one_in_use_until_it_comes() -> None:
-    commands = CommandHistory(PERIOD_S)
+    commands = command_history.CommandHistory(PERIOD_S)
     commands.publish(1.0, START_NS + 1)
     commands.publish(2.0, START_NS + PERIOD_NS + int(1.5 * PERIOD_NS))
     # y(1) was answered one and a half periods later; y(2) and y(3) are lost, y(4) arrives.
@@ -73,7 +66,7 @@ def test_a_late_command_leaves_the_older_one_in_use_until_it_comes() -> None:
 
 
 def test_a_command_that_came_while_the_driver_was_held_up_missed_its_sample() -> None:
-    commands = CommandHistory(PERIOD_S)
+    commands = command_history.CommandHistory(PERIOD_S)
     commands.publish(1.0, START_NS + 1)
     commands.publish(2.0, START_NS + int(1.2 * PERIOD_NS))
     # y(1) was due at 1.0 and taken at 1.5, before the driver looked at what had come.
@@ -84,7 +77,7 @@ def test_a_command_that_came_while_the_driver_was_held_up_missed_its_sample() ->
     (0, False), (PERIOD_NS // 10, True), (-PERIOD_NS, False), (100 * PERIOD_NS, True),
 ])
 def test_command_that_was_under_way_when_its_interval_ended_came_too_late(passed_ns, late):
-    commands = CommandHistory(PERIOD_S)
+    commands = command_history.CommandHistory(PERIOD_S)
     for _ in range(1000):
         commands.note_transit(passed_ns)
     commands.publish(1.0, START_NS)
@@ -96,7 +89,7 @@ def test_command_that_was_under_way_when_its_interval_ended_came_too_late(passed
 
 
 def test_the_command_next_to_the_one_in_use_may_have_acted_instead() -> None:
-    commands = CommandHistory(PERIOD_S)
+    commands = command_history.CommandHistory(PERIOD_S)
     for k, sent in enumerate((0.2, 1.2, 2.9)):
         commands.publish(float(k), START_NS + int(sent * PERIOD_NS))
     ends_ns = START_NS + 3 * PERIOD_NS
@@ -112,7 +105,7 @@ def test_the_command_next_to_the_one_in_use_may_have_acted_instead() -> None:
 
 
 def test_a_report_that_comes_after_its_output_is_not_taken_for_the_next_one() -> None:
-    commands = CommandHistory(PERIOD_S)
+    commands = command_history.CommandHistory(PERIOD_S)
     commands.output_ns = START_NS
     assert commands.reported_over(1, START_NS + PERIOD_NS) == []
     commands.report(10.0, START_NS + PERIOD_NS - 1000)
@@ -121,7 +114,7 @@ def test_a_report_that_comes_after_its_output_is_not_taken_for_the_next_one() ->
 
 
 def test_the_report_of_an_interval_that_took_longer_holds_for_all_of_it() -> None:
-    commands = CommandHistory(PERIOD_S)
+    commands = command_history.CommandHistory(PERIOD_S)
     commands.output_ns = START_NS
     commands.report(10.0, START_NS + 3 * PERIOD_NS - 1000)
     # Two samples were never taken: the driver was held up from the first to the third.
@@ -133,7 +126,7 @@ def test_the_report_of_an_interval_that_took_longer_holds_for_all_of_it() -> Non
 
 def uses(pattern: list[bool], use: str = 'auto') -> tuple[list[bool], int]:
     """Of outputs with and without a report: whether it is used, and how many are missed."""
-    commands = CommandHistory(PERIOD_S, use)
+    commands = command_history.CommandHistory(PERIOD_S, use)
     commands.output_ns = START_NS
     used = []
     for k, is_reported in enumerate(pattern, 1):
@@ -144,7 +137,7 @@ def uses(pattern: list[bool], use: str = 'auto') -> tuple[list[bool], int]:
 
 
 def test_reports_are_used_from_the_first_on_until_they_stop() -> None:
-    n = CONSISTENT
+    n = command_history.CONSISTENT
     used, unreported = uses(
         [False] * 3 + [True] * (n + 10) + [False] + [True] * 5 + [False] * 2 * n + [True] * n)
     assert used == [
@@ -156,7 +149,7 @@ def test_reports_are_used_from_the_first_on_until_they_stop() -> None:
 
 
 def test_a_driver_that_leaves_reports_out_from_the_beginning_has_to_show_many_in_a_row() -> None:
-    n = CONSISTENT
+    n = command_history.CONSISTENT
     used, _ = uses([True, False] * 5 + [True] * n)
     assert used == [True, *[False] * (9 + n - 1), True]
 
@@ -166,7 +159,7 @@ def test_a_driver_that_leaves_reports_out_from_the_beginning_has_to_show_many_in
     (0.0, 0.0, -2.0),
 ])
 def test_the_origin_of_reports_is_found_whether_the_motor_lags_or_is_limited(lag, beyond, most):
-    origin, position = ReportOrigin(), 0.0
+    origin, position = command_history.ReportOrigin(), 0.0
     for k in range(1000):
         command = sin(0.1 * k)
         position = lag * position + (1.0 - lag) * min(command, most)
@@ -184,7 +177,7 @@ def test_reports_are_used_always_or_never_where_that_is_asked_for(pattern: list[
 
 @pytest.mark.parametrize('use', ['true', 'auto', 'false'])
 def test_first_command_goes_on_from_a_report_of_its_own_interval(use: str) -> None:
-    commands = CommandHistory(PERIOD_S, use)
+    commands = command_history.CommandHistory(PERIOD_S, use)
     assert isnan(commands.newest_report(START_NS))
     commands.report(7.0, START_NS)
     assert commands.newest_report(START_NS + 1000) == 7.0
@@ -200,7 +193,7 @@ def test_first_command_goes_on_from_a_report_of_its_own_interval(use: str) -> No
     ({'lockstep': True, 'estimator.use_applied_control': True}, 'false'),
 ])
 def test_use_of_reports_follows_the_parameters(changes: dict[str, object], use: str) -> None:
-    assert report_use(Parameters(changes)) == use
+    assert command_history.report_use(Parameters(changes)) == use
 
 
 def paced_counter(samples: int = 40) -> tuple[SampleCounter, int]:
@@ -305,7 +298,7 @@ def test_of_two_senders_one_is_used_from_the_start(first, second, offset, number
 ])
 def test_control_acts_from_its_arrival_though_the_plant_was_held_up(periods_ago, applied):
     now_ns = 100 * PERIOD_NS
-    held = HeldControl()
+    held = command_history.HeldControl()
     for v, ago in ((1.0, 9.0), (2.0, periods_ago)):
         held.take(v, now_ns - int(ago * PERIOD_NS))
     ended_ns = [now_ns - 1.5 * PERIOD_NS, now_ns - 0.5 * PERIOD_NS, inf]
@@ -316,7 +309,7 @@ def told(
     index: list[int], outputs: list[float], stamps: list[float], reported: bool,
 ) -> list[float]:
     """v of the intervals, where the messages of v are numbered from 0; times in sample periods."""
-    v = v_of_intervals(
+    v = command_history.v_of_intervals(
         np.array(index), (np.array(outputs) * 1e6).astype(np.int64),
         (np.array(stamps) * 1e6).astype(np.int64), np.arange(float(len(stamps))), reported,
     )

@@ -6,13 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from backlash_ros.core.records.readings import (
-    failed,
-    own_readings,
-    quantum,
-    unwrapped,
-    without_slips,
-)
+from backlash_ros.core.records import readings
 from backlash_ros.core.records.record import Record, RecordError
 from backlash_ros.core.records.rows_to_record import averaged, record_of
 from backlash_ros.core.records.stamps import spread_evenly
@@ -287,7 +281,7 @@ def repeated(times: int) -> Array:
 
 @pytest.mark.parametrize('times', [2, 3, 5, 12])
 def test_rows_that_repeat_a_slower_sensor_are_no_readings(times: int) -> None:
-    own, period = own_readings(T, repeated(times))
+    own, period = readings.own_readings(T, repeated(times))
     assert own.tolist() == (np.arange(len(T)) % times == 0).tolist()
     assert period == pytest.approx(times * 0.005)
 
@@ -297,7 +291,7 @@ def test_rows_that_repeat_a_slower_sensor_are_no_readings(times: int) -> None:
     np.where(np.arange(len(T)) % 2 == 0, MOTION, np.nan),
 ], ids=['noise', 'coarse', 'square', 'stepped', 'rest', 'short', 'every second'])
 def test_what_only_looks_repeated_is_kept(y: Array) -> None:
-    own, period = own_readings(T[:len(y)], y)
+    own, period = readings.own_readings(T[:len(y)], y)
     assert (own.tolist(), period) == (np.isfinite(y).tolist(), 0.0)
 
 
@@ -307,7 +301,7 @@ def test_reads_that_failed_are_lost(value: float, share: float) -> None:
     y = 2.0 + MOTION
     wrong = np.random.default_rng(4).random(len(y)) < share
     y[wrong] = value
-    found, told = failed(y)
+    found, told = readings.failed(y)
     assert told == value
     # Three in a row are rare enough.
     assert found.tolist() == wrong.tolist()
@@ -316,7 +310,7 @@ def test_reads_that_failed_are_lost(value: float, share: float) -> None:
 
 @pytest.mark.parametrize('y', [MOTION, np.round(20.0 * MOTION), SQUARE, STEPPED, MOTION[:8]])
 def test_values_that_a_motion_passes_are_readings(y: Array) -> None:
-    assert not failed(y)[0].any()
+    assert not readings.failed(y)[0].any()
 
 
 @pytest.mark.parametrize('turn', [360.0, 2.0 * np.pi, 4096.0])
@@ -324,7 +318,7 @@ def test_values_that_a_motion_passes_are_readings(y: Array) -> None:
 def test_an_angle_that_begins_anew_is_unwrapped(turn: float, step: float) -> None:
     angle = turn * (0.9 * MOTION + 0.3)
     angle = np.round(angle / step) * step if step * 100 < turn and step else angle
-    found, told = unwrapped(np.mod(angle, turn))
+    found, told = readings.unwrapped(np.mod(angle, turn))
     assert told == turn
     assert found - found[0] == pytest.approx(angle - angle[0], abs=1e-9 * turn)
     record: Record = record_of(T, MOTION, np.mod(angle, turn))
@@ -336,7 +330,7 @@ def test_an_angle_that_begins_anew_is_unwrapped(turn: float, step: float) -> Non
     360.0 * np.mod(np.arange(len(T)) * 0.37, 1.0),
 ], ids=['square', 'smooth', 'half', 'stepped', 'short', 'too fast'])
 def test_what_only_jumps_is_not_unwrapped(values: Array) -> None:
-    found, told = unwrapped(values)
+    found, told = readings.unwrapped(values)
     assert told == 0.0
     assert found is values
 
@@ -353,7 +347,7 @@ def test_a_turn_that_was_lost_is_taken_out_and_said(turn: float) -> None:
     (SQUARE, SQUARE), (MOTION, MOTION + np.where(T > 3.0, 6.0, 0.0)), (STEPPED, 9.0 * STEPPED),
 ], ids=['v jumps', 'no whole turn', 'stepped'])
 def test_what_v_does_and_what_is_no_turn_is_kept(v: Array, y: Array) -> None:
-    assert without_slips(y, v)[1] == 0.0
+    assert readings.without_slips(y, v)[1] == 0.0
 
 
 @pytest.mark.parametrize(('y', 'step'), [
@@ -363,4 +357,4 @@ def test_what_v_does_and_what_is_no_turn_is_kept(v: Array, y: Array) -> None:
     (np.full(9, 3.0), 0.0),
 ])
 def test_the_step_of_a_quantised_y_is_told(y: Array, step: float) -> None:
-    assert quantum(y) == pytest.approx(step, rel=1e-3)
+    assert readings.quantum(y) == pytest.approx(step, rel=1e-3)

@@ -10,14 +10,9 @@ import yaml
 from places import ROOT
 
 from backlash_ros.tools.bringup import __main__ as bringup
+from backlash_ros.tools.bringup import watch
 from backlash_ros.tools.bringup.plan import AxisPlan, RunPlan, plan_processes, prepare
 from backlash_ros.tools.bringup.supervisor import Child, child_environment, foreign_environment
-from backlash_ros.tools.bringup.watch import (
-    LATE_DEADLINE_S,
-    START_DEADLINE_S,
-    AxisProgress,
-    describe,
-)
 from backlash_ros.tools.cli import BrokenOffError
 from backlash_ros.tools.config import effective_parameters
 
@@ -97,7 +92,7 @@ def test_what_the_user_has_set_reaches_the_nodes(tmp_path, monkeypatch):
 def test_errors_are_in_percent_of_the_truth_where_it_is_known() -> None:
     event = {'m': 1.43, 'true_m': 1.3, 'c_r': 2.7, 'true_c_r': None, 'c_l': -3.03,
              'true_c_l': -3.0, 'lost': 2}
-    assert describe(event) == 'm 1.43 (+10.0 %)  c_r 2.7  c_l -3.03 (-1.0 %)  lost 2'
+    assert watch.describe(event) == 'm 1.43 (+10.0 %)  c_r 2.7  c_l -3.03 (-1.0 %)  lost 2'
 
 
 def plan(folder: Path, driver: str, *names: str, **values: object) -> RunPlan:
@@ -176,12 +171,12 @@ def test_one_axis_alone_can_be_taken_from_the_file(tmp_path: Path) -> None:
     assert all('__ns:=/tilt' in process.command for process in processes)
 
 
-def begun(folder: Path, driver: str = '', **values: object) -> AxisProgress:
+def begun(folder: Path, driver: str = '', **values: object) -> watch.AxisProgress:
     p = effective_parameters(None).replaced({'samples': 100, 'driver': driver, **values})
-    return AxisProgress(AxisPlan('', p, folder, record=True))
+    return watch.AxisProgress(AxisPlan('', p, folder, record=True))
 
 
-def let_pass(axis: AxisProgress, seconds: float) -> None:
+def let_pass(axis: watch.AxisProgress, seconds: float) -> None:
     axis.began -= seconds
     axis.moved -= seconds
 
@@ -232,7 +227,7 @@ def test_too_few_samples_are_an_error_when_the_time_is_over(tmp_path: Path) -> N
     axis = begun(tmp_path, 'some command')
     for sample in (7, 48):
         axis.take({'sample': sample})
-    axis.began -= 1.0 + LATE_DEADLINE_S - 0.5
+    axis.began -= 1.0 + watch.LATE_DEADLINE_S - 0.5
     axis.check_pace()
     axis.began -= 1.0
     with pytest.raises(BrokenOffError, match=r'^only 42 of 100 samples, '):
@@ -242,7 +237,7 @@ def test_too_few_samples_are_an_error_when_the_time_is_over(tmp_path: Path) -> N
 def test_a_driver_without_a_first_sample_is_an_error_unless_somebody_else_starts_it(tmp_path):
     for driver in ('some command', 'none'):
         axis = begun(tmp_path, driver)
-        let_pass(axis, START_DEADLINE_S - 1.0)
+        let_pass(axis, watch.START_DEADLINE_S - 1.0)
         axis.check_pace()
         let_pass(axis, 2.0)
         if driver == 'none':

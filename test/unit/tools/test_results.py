@@ -11,22 +11,17 @@ import pytest
 from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core import Parameters, build_closed_loop
 from backlash_ros.core.loop.learned_model import LearnedModel
-from backlash_ros.core.simulation.run_record import (
-    COLUMNS,
-    RunRecord,
-    control_error_rms,
-    settling_time,
-)
+from backlash_ros.core.simulation import run_record
 from backlash_ros.tools.cli import InputError
 from backlash_ros.tools.runs import files as results
 from backlash_ros.tools.runs.summary import summarise
 
 
-def without_truth(run: RunRecord) -> RunRecord:
+def without_truth(run: run_record.RunRecord) -> run_record.RunRecord:
     rows = run.rows.copy()
     for name in ('u', 'true_m', 'true_c_r', 'true_c_l'):
-        rows[:, COLUMNS.index(name)] = nan
-    return RunRecord(rows, run.sample_period, run.lost_samples)
+        rows[:, run_record.COLUMNS.index(name)] = nan
+    return run_record.RunRecord(rows, run.sample_period, run.lost_samples)
 
 
 OLD_HEADER = 't,y_m,y,u_d,v,u,m,c_r,c_l,f'  # of samples.csv before version 0.3
@@ -34,7 +29,7 @@ LEARNED = LearnedModel((0.1, 0.05), (1.0, -0.9), 1, (0.1, 0.2, 0.3, 0.4, nan), 1
 
 
 @pytest.fixture(scope='module')
-def run() -> RunRecord:
+def run() -> run_record.RunRecord:
     lossy = Parameters({'output_loss': 0.1, 'estimator.law': 'lms'})
     return build_closed_loop(lossy).run(150)
 
@@ -50,7 +45,7 @@ def test_samples_are_written_in_full_precision_and_u_only_where_it_is_known(run,
             np.testing.assert_array_equal(again.column(name), record.column(name))
 
 
-def test_what_is_not_finite_becomes_null(run: RunRecord, tmp_path: Path) -> None:
+def test_what_is_not_finite_becomes_null(run: run_record.RunRecord, tmp_path: Path) -> None:
     path = tmp_path / 'summary.json'
     results.write_summary({'a': nan, 'b': [1.0, float('inf')], 'c': {'d': -float('inf')}}, path)
     assert json.loads(path.read_text()) == {'a': None, 'b': [1.0, None], 'c': {'d': None}}
@@ -60,13 +55,13 @@ def test_what_is_not_finite_becomes_null(run: RunRecord, tmp_path: Path) -> None
     assert stored['estimator'] is None
 
 
-def test_summary_tells_the_states_by_their_share(run: RunRecord) -> None:
+def test_summary_tells_the_states_by_their_share(run: run_record.RunRecord) -> None:
     rows = run.rows.copy()
-    codes = rows[:, COLUMNS.index('status')]
+    codes = rows[:, run_record.COLUMNS.index('status')]
     codes[:] = 1.0
     codes[:len(codes) // 2] = 0.0
     codes[-1] = 2.0
-    summary = summarise(RunRecord(rows, 0.01), None)
+    summary = summarise(run_record.RunRecord(rows, 0.01), None)
     assert summary['final_status'] == 'not excited'
     share = summary['status_share']
     assert list(share) == ['acquiring', 'tracking', 'not excited', 'no data', 'inconsistent']
@@ -74,7 +69,7 @@ def test_summary_tells_the_states_by_their_share(run: RunRecord) -> None:
     assert share['not excited'] == 1 / len(codes)
     assert sum(share.values()) == pytest.approx(1.0)
     codes[:] = nan
-    unknown = summarise(RunRecord(rows, 0.01), None)
+    unknown = summarise(run_record.RunRecord(rows, 0.01), None)
     assert unknown['final_status'] is None
     assert unknown['status_share'] is None
 
@@ -92,7 +87,7 @@ def test_summary_and_record_tell_the_model_that_was_believed_at_the_end(run, tmp
         assert repr(results.read_record(tmp_path / 'record.npz').learned) == repr(learned)
 
 
-def test_latency_is_given_in_milliseconds_without_the_unknown(run: RunRecord) -> None:
+def test_latency_is_given_in_milliseconds_without_the_unknown(run: run_record.RunRecord) -> None:
     latency = np.array([0.001, nan, 0.002, 0.003])
     summary = summarise(run, None, latency)
     assert summary['loop_latency_ms'] == pytest.approx({'p50': 2.0, 'p99': 2.98})
@@ -149,27 +144,27 @@ T = np.arange(1000) * 0.01
 ONES = np.ones(1000)
 
 
-def record(samples: int = 1000, **signals: object) -> RunRecord:
-    rows = np.full((samples, len(COLUMNS)), nan)
-    rows[:, COLUMNS.index('t')] = T[:samples]
+def record(samples: int = 1000, **signals: object) -> run_record.RunRecord:
+    rows = np.full((samples, len(run_record.COLUMNS)), nan)
+    rows[:, run_record.COLUMNS.index('t')] = T[:samples]
     for name, values in signals.items():
-        rows[:, COLUMNS.index(name)] = values
-    return RunRecord(rows, 0.01)
+        rows[:, run_record.COLUMNS.index(name)] = values
+    return run_record.RunRecord(rows, 0.01)
 
 
 def test_settling_time_of_an_exponential_is_when_it_reaches_one_percent() -> None:
     estimate = 3.0 * (1.0 + np.exp(-T))
     assert exp(-4.61) < 0.01 < exp(-4.60)
-    assert settling_time(T, estimate, 3.0 * ONES) == pytest.approx(4.61)
-    assert settling_time(T, -estimate, -3.0 * ONES) == pytest.approx(4.61)
+    assert run_record.settling_time(T, estimate, 3.0 * ONES) == pytest.approx(4.61)
+    assert run_record.settling_time(T, -estimate, -3.0 * ONES) == pytest.approx(4.61)
 
 
 def test_run_without_samples_has_no_figures() -> None:
     nothing = record(samples=0)
     assert nothing.samples == 0
     assert not nothing.has_truth
-    assert control_error_rms(nothing) is None
-    assert settling_time(T[:0], ONES[:0], ONES[:0]) is None
+    assert run_record.control_error_rms(nothing) is None
+    assert run_record.settling_time(T[:0], ONES[:0], ONES[:0]) is None
 
 
 def test_truth_is_known_only_if_it_is_known_throughout() -> None:
