@@ -20,7 +20,6 @@ from backlash_ros.core.simulation import run_record
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.options import OptionParser
 from backlash_ros.tools import cli
-from backlash_ros.tools.cli import NOTHING, BrokenOffError, number
 from backlash_ros.tools.config import effective_parameters
 from backlash_ros.tools.runs.files import result_directory
 from backlash_ros.tools.runs.read_run import run_loop
@@ -36,11 +35,9 @@ GAPLESS = {'backlash.c_r': 1e-9, 'backlash.c_l': -1e-9}
 
 
 class Result(NamedTuple):
-    """What became of a loop.
+    """What became of a loop; note: why the run broke off.
 
-    merits: what stands in the table behind the name, None where it does not apply: control error
-    [unit of u], relative tracking error, the part of it that the backlash costs, way of v [unit of
-    v], crossings of the gap per reversal. note: why the run broke off.
+    merits: what stands in the table behind the name, None where it does not apply.
     """
 
     name: str
@@ -50,9 +47,9 @@ class Result(NamedTuple):
 
     @property
     def row(self) -> tuple[str, ...]:
-        if self.note:
-            return (self.name, 'broke off', *[NOTHING] * (len(COMPARISON_HEADER) - 2))
-        return (self.name, *(number(merit, 3) for merit in self.merits))
+        cells = ['broke off', *[cli.NOTHING] * (len(COMPARISON_HEADER) - 2)] if self.note else \
+            [cli.number(merit, 3) for merit in self.merits]
+        return (self.name, *cells)
 
 
 def contenders(scenario: Parameters) -> dict[str, dict[str, object]]:
@@ -60,10 +57,8 @@ def contenders(scenario: Parameters) -> dict[str, dict[str, object]]:
     m, c_r, c_l = (getattr(scenario.backlash, name) for name in ('m', 'c_r', 'c_l'))
     tracks = {'structure': 'tracking', 'fixed.doubt': 0.5}
     return {
-        **{
-            f'{law}, u_d = y_m + f v': {'structure': 'proportional', 'estimator.law': law}
-            for law in ('printed', 'lms', 'moving_horizon')
-        },
+        **{f'{law}, u_d = y_m + f v': {'structure': 'proportional', 'estimator.law': law}
+           for law in ('printed', 'lms', 'moving_horizon')},
         'gradient, four blocks': {
             'structure': 'pole_placement', 'estimator.law': 'gradient',
             # With less, y, which they feed back unfiltered, has to be less noisy.
@@ -84,11 +79,7 @@ def _fixed(m: float, c_r: float, c_l: float) -> dict[str, object]:
 
 
 def compare(scenario: Parameters, samples: int) -> list[Result]:
-    """Run every loop and return its figures of merit.
-
-    Where y follows y_m, y_m is scaled by |G| at its frequency, so that every loop asks about the
-    same motion of G.
-    """
+    """Run every loop and return its figures of merit."""
     bar = tqdm(contenders(scenario).items(), desc='compare', unit='loop', disable=None)
     return [_measure(name, scenario, changes, samples) for name, changes in bar]
 
@@ -100,7 +91,7 @@ def _measure(
     if p.estimator.law != scenario.estimator.law:
         p = p.replaced({'estimates.load': False})  # they belong to another law
     follows = p.structure != 'proportional'  # else y_m sets u_d
-    if follows:
+    if follows:  # scaled by |G| at its frequency, so that every loop asks for the same motion of G
         z = np.exp(1j * scenario.frequency * scenario.sample_period)
         gain = abs(complex(build_model(scenario).response(np.array([z]))[0]))
         p = p.replaced({'amplitude': gain * scenario.amplitude, 'bias': gain * scenario.bias})
@@ -108,7 +99,7 @@ def _measure(
     delay = loop.controller.structure.delay
     try:
         run = run_loop(loop, samples)
-    except BrokenOffError as broken:
+    except cli.BrokenOffError as broken:
         return Result(name, note=str(broken))
     t, since = run.column('t'), 0.2 * run.samples * run.sample_period
     window = max(round(COMPARISON_WINDOW_S / run.sample_period), 1)
@@ -118,29 +109,14 @@ def _measure(
         gapless = run_loop(build_closed_loop(p.replaced({
             **GAPLESS, **_fixed(p.backlash.m, 0.0, 0.0), 'fixed.doubt': 0.0,
         })), samples)
-        error, best = (
-            run_record.delayed_tracking_error_rms(each, delay, since) for each in (run, gapless)
-        )
+        error, best = (run_record.delayed_tracking_error_rms(each, delay, since)
+                       for each in (run, gapless))
         penalty = None if error is None or best is None else error - best
     return Result(name, (
         run_record.control_error_rms(run), error, penalty,
         run_record.total_variation(run.column('v')[t >= since]),
         run_record.gap_crossings_per_reversal(run, since),
     ), ErrorCurves(name, t, moving_rms(control_error(run), window), tracking))
-
-
-def comparison_document(scenario: Parameters, results: Sequence[Result], figure: str) -> str:
-    """docs/results/comparison.md as text."""
-    template = Template(Path(__file__).with_name('comparison.md').read_text(encoding='utf-8'))
-    numbers = {'frequency': scenario.frequency, 'noise': scenario.output_noise_std,
-               **vars(scenario.backlash)}
-    return template.substitute(
-        {name: f'{value:g}' for name, value in numbers.items() if isinstance(value, float)},
-        figure=figure, waveform=scenario.waveform, header=' | '.join(COMPARISON_HEADER),
-        rule='|---' * len(COMPARISON_HEADER),
-        rows='\n'.join(f'| {" | ".join(result.row)} |' for result in results),
-        notes=''.join(f'- {result.name}: {result.note}.\n' for result in results if result.note),
-    )
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -161,7 +137,16 @@ def _compare(args: Sequence[str] | None) -> None:
     (out / figure).parent.mkdir(parents=True, exist_ok=True)
     curves = [result.curves for result in results if result.curves is not None]
     write_atomically(out / figure, png(draw_error_curves(curves, COMPARISON_WINDOW_S)))
-    write_atomically(document, comparison_document(scenario, results, figure))
+    template = Template(Path(__file__).with_name('comparison.md').read_text(encoding='utf-8'))
+    numbers = {'frequency': scenario.frequency, 'noise': scenario.output_noise_std,
+               **vars(scenario.backlash)}
+    write_atomically(document, template.substitute(
+        {name: f'{value:g}' for name, value in numbers.items() if isinstance(value, float)},
+        figure=figure, waveform=scenario.waveform, header=' | '.join(COMPARISON_HEADER),
+        rule='|---' * len(COMPARISON_HEADER),
+        rows='\n'.join(f'| {" | ".join(result.row)} |' for result in results),
+        notes=''.join(f'- {result.name}: {result.note}.\n' for result in results if result.note),
+    ))
     print(f'document: {document}')
 
 

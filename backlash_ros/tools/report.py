@@ -33,8 +33,7 @@ HTML_SYMBOLS = {'m': 'm', 'c_r': 'c<sub>r</sub>', 'c_l': 'c<sub>l</sub>'}
 def write_report(run: files.Run, out: Path) -> dict[str, Any]:
     """Write report, figures, samples.csv and summary.json of a run to out; return the summary.
 
-    Prints on stderr what the user has to know about the source. Raises InputError for a run without
-    samples.
+    Raises InputError for a run without samples.
     """
     summary = told.summarise(run.record, run.parameters, run.latency_s)
     notes, lost = list(run.notes), summary['lost_samples']
@@ -72,8 +71,7 @@ def _figures(
         yield Picture(
             'log.png', 'v and y', 'What the log holds, as it was read. With play, y over v is a '
             'loop with level stretches, as wide as the gap, where v turns.',
-            png(figures.draw_log(run)),
-        )
+            png(figures.draw_log(run)))
         return
     start, end = parts = told.interesting_parts(run, parameters)
     if run.has_truth:
@@ -81,26 +79,22 @@ def _figures(
             'parameter_errors.png', 'Parameter errors over time (Figure 4 of the paper)',
             'How far the estimates are from the hidden backlash, and in percent of it. A dot marks '
             'the time from which the error stays within 1 %.',
-            png(figures.draw_parameter_errors(run, start, summary['settling_time_s'])),
-        )
+            png(figures.draw_parameter_errors(run, start, summary['settling_time_s'])))
     yield Picture(
-        'estimates.png', 'Estimates over time',
-        'What the controller has learned from v and y alone; a band shows how sure it is where '
-        'the law knows.', png(figures.draw_estimates(run)),
-    )
+        'estimates.png', 'Estimates over time', 'What the controller has learned from v and y '
+        'alone; a band shows how sure it is where the law knows.',
+        png(figures.draw_estimates(run)))
     error, innovation = told.control_error(run), run.column('innovation')
     if np.isfinite(error).any():
         yield Picture(
             'control_error.png', 'Control error of this run',
             'e = u − u<sub>d</sub> (3.4): what the inverse leaves of the backlash.',
-            png(figures.draw_closer(run, error, '$u - u_d$ [unit of u]', parts)),
-        )
+            png(figures.draw_closer(run, error, '$u - u_d$ [unit of u]', parts)))
     elif np.isfinite(innovation).any():
         yield Picture(
             'innovation.png', 'Innovation',
             'y minus its prediction. White and small: the model explains the plant.',
-            png(figures.draw_closer(run, innovation, r'$y - \hat{y}$ [unit of y]', parts)),
-        )
+            png(figures.draw_closer(run, innovation, r'$y - \hat{y}$ [unit of y]', parts)))
     if run.has_truth and parameters is not None:
         curves, window_s, notes = told.compare_laws(run, parameters)
         duration = min(float(run.column('t')[-1]) + run.sample_period, 1e4 * run.sample_period)
@@ -108,28 +102,22 @@ def _figures(
             'laws.png', 'Control error of the laws (Figure 5 of the paper)',
             'This run beside the other laws, simulated with the same parameters, over the first '
             f'{duration:.6g} s.' + ''.join(f' Without a curve: {escape(note)}.' for note in notes),
-            png(figures.draw_error_curves(curves, window_s)),
-        )
+            png(figures.draw_error_curves(curves, window_s)))
     yield Picture(
         'hysteresis.png', 'Backlash: the v–u loop',
         'u follows the right line going up, the left line going down, and is held between them. '
         'Where a dashed line lies on the wide one, the estimate is right.' if run.has_truth else
         'The loop as the last estimates see it: u itself was not measured.',
-        png(figures.draw_hysteresis(run, end)),
-    )
+        png(figures.draw_hysteresis(run, end)))
     y_m, delay, followed = told.followed_reference(run, parameters)
     yield Picture(
-        'output.png', 'Reference and output',
-        'y follows y<sub>m</sub>.' if followed else
+        'output.png', 'Reference and output', 'y follows y<sub>m</sub>.' if followed else
         'Each on its own scale: y does not follow y<sub>m</sub>, nor does the structure '
         'u<sub>d</sub> = y<sub>m</sub> + f v aim at that.',
-        png(figures.draw_output(run, end, y_m, delay, followed)),
-    )
+        png(figures.draw_output(run, end, y_m, delay, followed)))
     yield Picture(
-        'input.png', 'Desired input and control',
-        'v jumps by the width of the gap whenever u<sub>d</sub> turns.',
-        png(figures.draw_input(run, parts)),
-    )
+        'input.png', 'Desired input and control', 'v jumps by the width of the gap whenever '
+        'u<sub>d</sub> turns.', png(figures.draw_input(run, parts)))
 
 
 def headline(summary: Mapping[str, Any]) -> str:
@@ -138,18 +126,14 @@ def headline(summary: Mapping[str, Any]) -> str:
         return 'A log of v and y, which no controller has estimated anything from: ' \
                '<code>identify</code> tells its backlash, <code>replay</code> what a controller ' \
                'would have learned.'
-    law = summary['estimator']
+    law, times = summary['estimator'], summary['settling_time_s']
     who = f'The law <b>{escape(law)}</b>' if law else 'The controller'
     if summary['truth']['m'] is None:
         return f'{who} estimated the backlash; no truth was recorded to compare with.'
-    times = summary['settling_time_s']
-    late = [HTML_SYMBOLS[name] for name, time in times.items() if time is None]
-    if late:
+    if late := [HTML_SYMBOLS[name] for name, time in times.items() if time is None]:
         return f'{who} did not bring {" and ".join(late)} to within 1 % of the truth.'
-    return (
-        f'{who} has had m, c<sub>r</sub> and c<sub>l</sub> within 1 % of the truth since '
-        f'<b>{max(times.values()):.4g} s</b>.'
-    )
+    return (f'{who} has had m, c<sub>r</sub> and c<sub>l</sub> within 1 % of the truth since '
+            f'<b>{max(times.values()):.4g} s</b>.')
 
 
 def _tables(summary: Mapping[str, Any]) -> str:
@@ -189,19 +173,15 @@ def make_parser() -> argparse.ArgumentParser:
     parser = OptionParser('report', description=__doc__)
     parser.add_argument('path', type=Path, help='a bag or its .mcap file, a folder of results, '
                         'samples.csv, or a log as identify reads it')
-    parser.add_argument('--config', type=Path, metavar='FILE',
-                        help='parameters of the run (default: parameters.yaml beside it)')
-    cli.add_options(parser, '--columns', '--axis', '--from', '--to', '--out')
+    cli.add_options(parser, '--config', '--columns', '--axis', '--from', '--to', '--out')
     return parser
 
 
 def _report(args: Sequence[str] | None) -> None:
     parser = make_parser()
     options = parser.parse_args(args)
-    span = cli.span_of(parser, options)
-    run, _ = read_run_or_log(
-        options.path.resolve(), options.config, span, options.axis, options.columns
-    )
+    run, _ = read_run_or_log(options.path.resolve(), options.config, cli.span_of(parser, options),
+                             options.axis, options.columns)
     out = files.result_directory(options.out)
     write_report(run, out)
     print(out / REPORT_PAGE)
