@@ -1,7 +1,5 @@
 """What every command line has in common: exit codes, errors in one line, numbers, shipped files."""
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import sys

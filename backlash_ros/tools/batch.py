@@ -1,7 +1,5 @@
 """Many simulated runs: seeds and sweeps as jobs, here or on a cluster, and their statistics."""
 
-from __future__ import annotations
-
 import itertools
 import logging
 import multiprocessing

@@ -1,7 +1,5 @@
 """What the command lines of all tools share: options, errors, signals, tables."""
 
-from __future__ import annotations
-
 import argparse
 import atexit
 import signal
@@ -158,7 +156,7 @@ class StopRequests:
         self._came_at_s = -inf
         self._before: dict[int, Any] = {}
 
-    def __enter__(self) -> StopRequests:
+    def __enter__(self) -> 'StopRequests':
         for caught in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             # Under nohup a hang-up stays ignored.
             if caught != signal.SIGHUP or signal.getsignal(caught) is not signal.SIG_IGN:

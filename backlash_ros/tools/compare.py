@@ -1,7 +1,5 @@
 """`compare`: every law and structure on one scenario, as a figure, a table and a document."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Mapping, Sequence

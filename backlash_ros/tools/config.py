@@ -4,8 +4,6 @@ A section /AXIS/NODE holds values of one node of one axis; ** stands for all axe
 /NODE for the node without a namespace. A named node goes before a named axis.
 """
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass

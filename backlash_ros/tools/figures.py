@@ -1,7 +1,5 @@
 """Every figure of `report` and `compare`, and what others draw theirs with."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path

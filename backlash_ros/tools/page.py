@@ -1,7 +1,5 @@
 """Self-contained HTML pages: no script, no font, no picture from elsewhere."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Sequence
 from html import escape

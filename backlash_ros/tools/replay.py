@@ -1,7 +1,5 @@
 """`replay`: a recorded run through the controller once more, with other parameters if wanted."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Sequence
@@ -63,7 +61,15 @@ def _replay(args: Sequence[str] | None) -> None:
         for change in changes:
             words = ' '.join(f'{name}={as_yaml(value)}' for name, value in change.items())
             run = _replayed(source._replace(parameters=source.parameters.replaced(change)), words)
-            rows.append((str(source.path), words, *_numbers(run)))
+            tracking = run.column('t')[run.column('status') == Status.TRACKING]
+            innovation = run.column('innovation')[run.samples // 2:]
+            known = innovation[np.isfinite(innovation)]
+            rows.append((
+                str(source.path), words,
+                *(float(run.column(std + name)[-1]) for std in ('', 'std_') for name in BACKLASH),
+                float(tracking[0]) if len(tracking) else nan,
+                float(np.sqrt(np.mean(known**2))) if len(known) else nan,
+            ))
     header = ('run', 'changed', *BACKLASH, *(f'std_{name}' for name in BACKLASH),
               'tracking from [s]', 'innovation RMS')
     path = result_directory(options.out) / 'replays.csv'
@@ -123,36 +129,19 @@ def _one(source: Source, out: Path | None) -> None:
         (name, cli.number(recorded.column(name)[-1], 6), cli.number(summary['final'][name], 6),
          cli.number(summary['final_std'][name], 2)) for name in BACKLASH
     ]))
-    print(_states(replayed) if isnan(recorded.column('m')[-1]) else _parted(recorded, replayed))
+    status, parted = replayed.column('status'), parting(recorded, replayed)
+    if isnan(recorded.column('m')[-1]):  # of a log, which has no estimates to compare with
+        begins = np.append(0, np.flatnonzero(np.diff(status)) + 1)
+        states = [f'{Status(int(status[k])).word} from {replayed.column("t")[k]:.3g} s'
+                  for k in begins[:8]]
+        print(f'states: {", ".join(states)}', *[f'… ({len(begins)} in all)'] * (len(begins) > 8))
+    elif parted is None:
+        print('the estimates are those of the run, to the last bit')
+    else:
+        print(f'the estimates part from those of the run at t = {parted.t:.4g} s: {parted.name} '
+              f'was {parted.recorded:.6g} and is {parted.replayed:.6g}; by {parted.largest:.3g} '
+              'standard deviations at most')
     print(directory / 'replay.png', directory / REPORT_PAGE, sep='\n')
-
-
-def _states(run: RunRecord) -> str:
-    """From when on which state held: all that a log, which has no estimates, is compared with."""
-    status = run.column('status')
-    begins = np.append(0, np.flatnonzero(np.diff(status)) + 1)
-    shown = [f'{Status(int(status[k])).word} from {run.column("t")[k]:.3g} s' for k in begins[:8]]
-    more = f', … ({len(begins)} in all)' if len(begins) > len(shown) else ''
-    return f'states: {", ".join(shown)}{more}'
-
-
-def _parted(recorded: RunRecord, replayed: RunRecord) -> str:
-    parted = parting(recorded, replayed)
-    return 'the estimates are those of the run, to the last bit' if parted is None else (
-        f'the estimates part from those of the run at t = {parted.t:.4g} s: {parted.name} was '
-        f'{parted.recorded:.6g} and is {parted.replayed:.6g}; by {parted.largest:.3g} standard '
-        'deviations at most'
-    )
-
-
-def _numbers(run: RunRecord) -> tuple[float, ...]:
-    """What a table has of a replay behind its name and changes."""
-    tracking = run.column('t')[run.column('status') == Status.TRACKING]
-    innovation = run.column('innovation')[run.samples // 2:]
-    known = innovation[np.isfinite(innovation)]
-    return (*(float(run.column(f'{std}{name}')[-1]) for std in ('', 'std_') for name in BACKLASH),
-            float(tracking[0]) if len(tracking) else nan,
-            float(np.sqrt(np.mean(known**2))) if len(known) else nan)
 
 
 def draw_replay(recorded: RunRecord, replayed: RunRecord) -> Figure:

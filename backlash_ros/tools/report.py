@@ -1,7 +1,5 @@
 """`report`: from a bag or saved results to report.html, figures and summary.json."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Iterator, Mapping, Sequence

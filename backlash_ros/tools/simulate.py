@@ -1,7 +1,5 @@
 """`simulate`: the controller and the plant in one process, once, for many seeds or in a sweep."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Sequence

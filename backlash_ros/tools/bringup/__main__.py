@@ -31,8 +31,6 @@ environment: the processes inherit it. Unless you set them yourself,
   OMP_NUM_THREADS and its like   are 1
 """
 
-from __future__ import annotations
-
 import argparse
 import signal
 import sys

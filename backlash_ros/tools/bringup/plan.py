@@ -1,7 +1,5 @@
 """From options to a checked plan of a run: its axes, and the processes of each."""
 
-from __future__ import annotations
-
 import argparse
 import shlex
 import sys

@@ -5,8 +5,6 @@ supervisor alone. A guardian, this module as a program, holds the other end of a
 supervisor dies of whatever cause, the pipe closes and the guardian stops what is left.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import selectors
@@ -28,7 +26,7 @@ from backlash_ros.tools.cli import ONE_THREAD, BrokenOffError
 
 # SIGINT lets a node end as by Ctrl-C; a recorder may need a while to close a large bag.
 ESCALATION = ((signal.SIGINT, 10.0), (signal.SIGTERM, 3.0), (signal.SIGKILL, 3.0))
-Events = list[tuple['Child', dict[str, Any]]]
+Events = list[tuple[Any, dict[str, Any]]]  # of a child each
 
 
 def child_environment(log_folder: Path, domain: int | None) -> dict[str, str]:
@@ -176,7 +174,7 @@ class ProcessSupervisor:
         self.children: list[Child] = []
         self._selector = selectors.DefaultSelector()
 
-    def __enter__(self) -> ProcessSupervisor:
+    def __enter__(self) -> 'ProcessSupervisor':
         self._guardian = subprocess.Popen(
             (sys.executable, '-m', 'backlash_ros.tools.bringup.supervisor'), bufsize=0,
             stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, env=with_source(os.environ),

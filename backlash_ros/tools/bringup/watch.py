@@ -1,7 +1,5 @@
 """A run in progress: what its processes say, how long to wait, when it is over, what went wrong."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

@@ -1,7 +1,5 @@
 """A run, and its files: its folder, samples.csv, record.npz, summary.json."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

@@ -3,8 +3,6 @@
 Of a bag: signals, estimates and truth, joined on the number of the sample.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress

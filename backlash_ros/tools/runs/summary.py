@@ -1,7 +1,5 @@
 """What is told of a run: its figures of merit, the content of summary.json, and its curves."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from math import isfinite, pi
 from typing import Any, NamedTuple
