@@ -84,10 +84,11 @@ _types_in: Any = cache(get_type_hints)
 
 
 def declared_in(group: type[Any], prefix: str = '') -> Iterator[Parameter]:
-    options = getattr(group, '_field_defaults', vars(group))
+    defaults = getattr(group, '_field_defaults', {})
     for name, kind in _types_in(group).items():
-        if isinstance(options.get(name), partial):
-            yield options[name](name=prefix + name, elements=get_args(kind))
+        declared = defaults.get(name) or getattr(group, name, None)
+        if isinstance(declared, partial):
+            yield declared(name=prefix + name, elements=get_args(kind))
         else:
             yield from declared_in(kind, f'{prefix}{name}.')
 

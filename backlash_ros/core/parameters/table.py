@@ -227,13 +227,12 @@ class TruePlant(NamedTuple):
         'input_disturbance it is no part of the u that plant/truth shows', 'u', low=0.0)
 
 
-class ParameterTree:
-    """All parameters: `tree.control.max` is the value of control.max."""
+class NodeParameters:
+    """What nodes are given beside the numbers of control."""
 
     sample_period: float = option(
         0.01, 'sample period T of G(z)', 's', low=0.0, above=True,
         used_by=(CONTROLLER, PLANT, REFERENCE_NODE), per_node=True)
-    plant: PlantModel
     actuator: ActuatorModel
     lockstep: bool = of_node(
         False, 'run as fast as the machine allows: each sample waits for reference and control',
@@ -241,18 +240,6 @@ class ParameterTree:
     wait_for_subscribers: int = of_node(
         0, 'start only when the main topic has this many listeners', low=0,
         used_by=(CONTROLLER, PLANT, REFERENCE_NODE))
-    estimator: EstimatorOptions
-    lms: LmsSteps
-    gradient: GradientStep
-    structure: str = option(
-        'proportional', 'linear part that makes u_d',
-        choices=('proportional', 'tracking', 'pole_placement'))
-    proportional: ProportionalGain
-    tracking: TrackingWeights
-    pole_placement: PolePlacementFilter
-    inverse: InverseOptions
-    fixed: FixedDoubt
-    control: ControlLimits
     autostart: bool = of_node(True, 'configure and activate at the start, without being asked')
     on_stop: str = option(
         'hold', 'last command at deactivation and at the end: v is held, set to zero as fast as '
@@ -266,11 +253,34 @@ class ParameterTree:
         'activated: publish nothing until it is gone, or go on and report it',
         choices=('stand_down', 'warn'), change='live', per_node=True)
     timeout: Timeouts
-    estimates: SavedEstimates
     joints: tuple[str, ...] = of_node(
         (), 'joints of an arm, each a loop of its own in one controller, in the order of their '
         'commands in an array; empty for one loop')
     io: DriverMessages
+
+
+class ControllerParameters:
+    """Model, estimator and control."""
+
+    plant: PlantModel
+    estimator: EstimatorOptions
+    estimates: SavedEstimates
+    lms: LmsSteps
+    gradient: GradientStep
+    structure: str = option(
+        'proportional', 'linear part that makes u_d',
+        choices=('proportional', 'tracking', 'pole_placement'))
+    proportional: ProportionalGain
+    tracking: TrackingWeights
+    pole_placement: PolePlacementFilter
+    inverse: InverseOptions
+    fixed: FixedDoubt
+    control: ControlLimits
+
+
+class SimulatedPlantParameters:
+    """The plant that is simulated."""
+
     backlash: SimulatedBacklash
     output_noise_std: float = simulated(0.0, 'simulated noise on y', 'y', low=0.0, change='live')
     output_quantum: float = simulated(
@@ -281,6 +291,11 @@ class ParameterTree:
     truth: TruePlant
     seed: int = simulated(1, 'seed of the simulated noise', low=0)
     samples: int = simulated(0, 'outputs to simulate, 0 for no end', low=0)
+
+
+class ReferenceParameters:
+    """The reference y_m."""
+
     waveform: str = of_reference(
         'sine', 'shape of y_m',
         choices=('sine', 'step', 'square', 'triangle', 'multisine', 'chirp', 'file'), change='live')
@@ -293,6 +308,11 @@ class ParameterTree:
         10.0, 'duration of a chirp', 's', low=0.0, above=True, change='live')
     bias: float = of_reference(0.0, 'constant added to y_m', 'y_m', change='live')
     file: str = of_reference('', 'CSV of rows t,y_m for waveform: file', change='live')
+
+
+class RunParameters:
+    """A run: its bag, its axes, its driver."""
+
     storage: str = option(
         'mcap', 'format of the bag', choices=('mcap', 'sqlite3'), used_by=(RECORDER,))
     bag: str = option(
@@ -307,6 +327,13 @@ class ParameterTree:
         '', 'command to start instead of plant, where {axis} stands for the name of the axis; '
         'none waits for a driver that is started elsewhere, empty is the simulated plant',
         used_by=(BRINGUP,))
+
+
+class ParameterTree(
+    RunParameters, ReferenceParameters, SimulatedPlantParameters, ControllerParameters,
+    NodeParameters,
+):
+    """All parameters: `tree.control.max` is the value of control.max."""
 
 
 BY_NAME: dict[str, Parameter] = {each.name: each for each in declared_in(ParameterTree)}
