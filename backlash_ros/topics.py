@@ -42,7 +42,7 @@ LABELS_OF = {
 
 
 def of_node(topic: str) -> str:
-    """The name under which its node publishes a topic, so that it follows the name of the node."""
+    """The name under which its node publishes a topic."""
     return '~/' + topic.partition('/')[2]
 
 

@@ -20,25 +20,14 @@ from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock
 
 from backlash_ros import topics
-from backlash_ros.core.assembly import (
-    WORKER_MODULES,
-    build_controller,
-    known_before,
-    takes_model_as_exact,
-    warnings_of,
-)
+from backlash_ros.core import assembly
 from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.jobs import Executor, WorkerExecutor
+from backlash_ros.core.loop import sample_counter
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.diagnosis import Neighbours
 from backlash_ros.core.loop.joint_loops import JointLoops
-from backlash_ros.core.loop.sample_counter import (
-    UNNUMBERED,
-    Output,
-    SampleCounter,
-    Timing,
-    kept_outputs,
-)
+from backlash_ros.core.loop.sample_counter import Output, SampleCounter, Timing
 from backlash_ros.core.parameters import CONTROLLER, ParameterError, Parameters
 from backlash_ros.nodes.control.joint import Joint, neighbours_of
 from backlash_ros.nodes.control.publishing import StepPublisher
@@ -52,9 +41,9 @@ from backlash_ros.nodes.runtime.process import ProcessNode, emit, run
 class ControllerNode(LifecycleNodeMixin, ProcessNode):
     """Answers every plant_output with a control; estimates and signals follow after it.
 
-    It has the life cycle of ROS 2. In lockstep the k-th tick of /clock, reference and plant_output
-    belong together, so that runs are repeatable; else the newest reference counts. With `joints`
-    there is a loop for each of them: a message has y of all, and one with v of all answers it.
+    A managed node. In lockstep the k-th tick of /clock, reference and plant_output belong together,
+    so that runs are repeatable; else the newest reference counts. With `joints` there is a loop for
+    each of them: a message has y of all, and one with v of all answers it.
     """
 
     def __init__(self) -> None:
@@ -64,14 +53,21 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
         p = self.settings
         check_style(p)
         for joint in p.joint_names:
-            own = p.of_joint(joint)
-            build_controller(own)  # raises ParameterError before the node takes part in anything
-            for warning in warnings_of(own, with_reference=False):
-                self.log.warning(f'{joint}: {warning}' if joint else warning)
+            own, of_joint = p.of_joint(joint), f'{joint}: ' if joint else ''
+            assembly.build_controller(own)  # raises ParameterError before anybody is found
+            for warning in assembly.warnings_of(own, with_reference=False):
+                self.log.warning(of_joint + warning)
+            if assembly.takes_model_as_exact(own):
+                self.log.info(
+                    f'{of_joint}plant.uncertainty is 0: G is taken as exact, which no data can '
+                    'check. Where it is not, estimates are off by more than their deviations: 0.2 '
+                    'allows for time constants that are 20 % off'
+                )
         self.active = False
         self.loops: JointLoops | None = None  # None while unconfigured
         # A fit that shared the process of the loop would hold up its commands.
-        self._executor: Executor = Executor() if p.lockstep else WorkerExecutor(WORKER_MODULES)
+        self._executor: Executor = \
+            Executor() if p.lockstep else WorkerExecutor(assembly.WORKER_MODULES)
         self._io = DriverIo(self, p)
         if not p.lockstep:
             # The first command begins with what the driver reports, even if it is not learned from.
@@ -85,17 +81,15 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
         self._around: tuple[Neighbours, Timing] | None = None  # at the newest look at the graph
         self._driver: Subscription | None = None  # plant_output, once it may begin
         self._ending: Timer | None = None  # sends the commands of on_timeout
-        self.joints: list[Joint] = []
-        self._rivals = RivalWatch(
-            self, self._io.topics.control, self._io.advertise, self._mind_rivals
-        )
+        to = self._io.topics
+        self._rivals = RivalWatch(self, to.control, self._io.advertise, self._mind_rivals)
         self._steps = StepPublisher(self, p.joint_names)
         # A stalled controller goes on with the newest values; in lockstep none may be skipped.
         # Woken by each y_m, the process would take half as much time again.
         self._io.listen_to_references(
             self._on_reference, KEPT_QOS if p.lockstep else 1, polled=not p.lockstep
         )
-        self.joints += [Joint(self, name, p.of_joint(name), self._io) for name in p.joint_names]
+        self.joints = [Joint(self, name, p.of_joint(name), self._io) for name in p.joint_names]
         offer_services(self, self.joints)
         turns = cycle(self.joints)
 
@@ -108,7 +102,7 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
             self.create_subscription(Clock, topics.CLOCK, self._on_clock, KEPT_QOS)
         else:
             self.every(0.1, self._look_for_silence)
-        to, name = self._io.topics, self.resolve_topic_name
+        name = self.resolve_topic_name
         self.log.info(
             f'started: {name(to.output)} and {name(to.reference)} in, {name(to.control)} out'
             f'{" for joints " if p.joints else ""}{", ".join(p.joints)}, '
@@ -116,13 +110,6 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
             + (f'{to.reference} and {to.output}' if p.autostart else
                f'ros2 lifecycle set {self.get_fully_qualified_name()} configure')
         )
-        exact = [joint for joint in p.joint_names if takes_model_as_exact(p.of_joint(joint))]
-        if exact:
-            self.log.info(
-                f'plant.uncertainty{" of " if exact[0] else ""}{", ".join(exact)} is 0: G is taken '
-                'as exact, which no data can check. Where it is not, estimates are off by more '
-                'than their deviations: 0.2 allows for time constants that are 20 % off'
-            )
         if p.autostart:
             untyped: Any = self
             untyped.trigger_configure()
@@ -130,14 +117,13 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
 
     @property
     def configured(self) -> list[ControlLoop]:
-        """The loops, none while there are none."""
         return [] if self.loops is None else list(self.loops.loops)
 
     # --- the life cycle --------------------------------------------------------------------------
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         try:
-            before = {joint.name: known_before(joint.p) for joint in self.joints}
+            before = {joint.name: assembly.known_before(joint.p) for joint in self.joints}
             drivers = {joint.name: joint.driver for joint in self.joints}
             self.loops = JointLoops(
                 self.settings, self._io.publish, drivers.__getitem__, before, self._counter,
@@ -198,7 +184,7 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
             if self._driver is None:
                 self._rivals.look()
                 self._steps.look()
-                kept = kept_outputs(self.settings.sample_period)
+                kept = sample_counter.kept_outputs(self.settings.sample_period)
                 self._driver = io.listen(self._on_output, min(kept, DEPTH))
                 emit('ready')
 
@@ -207,7 +193,6 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
         )
 
     def on_deactivate(self, state: LifecycleState | None) -> TransitionCallbackReturn:
-        """Send the last command as on_stop says, and save what was learned."""
         loops = self.loops
         if self.active and loops is not None:
             self.active = False
@@ -226,10 +211,7 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
     on_shutdown = on_deactivate
 
     def _send_last(self, loops: JointLoops) -> None:
-        """Send the commands that end all loops; v comes to rest where it takes too long.
-
-        So it does at a SIGTERM that comes meanwhile: whoever sends it will kill the process next.
-        """
+        """Send what ends all loops; v is held where that takes too long, or SIGKILL comes next."""
         p, told = self.settings, time.monotonic()
         longest_s, step_s = p.timeout.ramp, max(p.sample_period, 1e-3)
         deadline, cut_short = told + longest_s, ''
@@ -311,7 +293,8 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
         loops, (ticks, references, outputs) = self.loops, self._waiting
         while loops is not None and self.active and all(self._waiting):
             # A tick is the sample: messages are not told apart by number then.
-            output = outputs.popleft()._replace(stamp_ns=ticks.popleft(), sequence=UNNUMBERED)
+            unnumbered = outputs.popleft()._replace(sequence=sample_counter.UNNUMBERED)
+            output = unnumbered._replace(stamp_ns=ticks.popleft())
             if steps := loops.answer({'': output}, references.popleft()):
                 loops.by_name[''].core.refine()
                 self._follow_up(loops, steps)
@@ -344,7 +327,6 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
         self._mind_rivals()
 
     def _mind_rivals(self) -> None:
-        """Stand down or command again, as on_rival says, and tell of it."""
         stand_down = self.settings.on_rival == 'stand_down' \
             and any(rival.was_first for rival in self._rivals.found)
         changing = [loop for loop in self.configured if loop.standing_down != stand_down]
@@ -379,13 +361,11 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
             self._diagnose()
 
     def _send_next(self) -> None:
-        """Send the next commands of on_timeout."""
         if self._ending is not None and not (self.loops and self.active and self.loops.send_next()):
             self.destroy_timer(self._ending)
             self._ending = None
 
     def _diagnose(self, *joints: Joint) -> None:
-        """Publish what is going on with these joints, or all."""
         rivals, loops = self._rivals, self.loops
         for joint in joints or self.joints:
             # The graph and the times of messages are looked at once for all of them.

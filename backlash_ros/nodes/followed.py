@@ -25,12 +25,10 @@ from backlash_ros.topics import BACKLASH, DIAGNOSTICS
 
 
 class ControllerState:
-    """One controller, or a joint of it. node: its name, with namespace. level: of /diagnostics.
+    """One controller, or a joint of it.
 
-    values: of /diagnostics, as they stand there. estimates: value and half width of its band of
-    two deviations (nan where there are none). scales: the largest magnitudes that were shown.
-    events: time of day and text, the newest one last. watched: what stands below
-    `controller/watch` and came at the last look: label, time of arrival [ns], value.
+    estimates: value and half width of its band of two deviations. scales: the largest magnitudes
+    that were shown. watched: label, time of arrival [ns] and value of what came at the last look.
     """
 
     def __init__(self, node: str, joint: str = '') -> None:
@@ -58,7 +56,6 @@ class ControllerState:
             self._set_estimate(name, self.number(name), 2.0 * self.number(f'std_{name}'))
 
     def hear_value(self, label: str, message: Float64, info: dict[str, Any]) -> None:
-        """Take in one of the values that are watched."""
         self.watched.append((label, info['received_timestamp'], message.data))
         if label in BACKLASH:
             self._set_estimate(label, message.data, self.estimates[label][1])
@@ -72,7 +69,6 @@ class ControllerState:
         self.events.append((time.strftime('%H:%M:%S'), text))
 
     def number(self, key: str) -> float:
-        """A value of the diagnostics, nan where it is missing or no number."""
         try:
             return float(self.values.get(key, ''))
         except ValueError:
@@ -91,7 +87,6 @@ class ControllerState:
         return passed if SILENT_S < passed < inf else 0.0
 
     def word(self, now_s: float) -> str:
-        """Its state in a word or two."""
         if not self.message:
             return 'no diagnostics yet'
         if silent_s := self.silent_s(now_s):
@@ -102,11 +97,9 @@ class ControllerState:
 
 
 class FollowedControllers:
-    """Every controller of the domain, or those of some namespaces, by name.
+    """Every controller of the domain, or those of the wanted namespaces, by name.
 
-    wanted: names of controllers or namespaces, none for all. labels: which of the messages below
-    `controller/watch` to take, and depth: how many of each may wait. awaited: what is waited for
-    while there is none.
+    labels: which of the messages below `controller/watch` to take; depth: how many may wait.
     """
 
     def __init__(

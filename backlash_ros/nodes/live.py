@@ -33,11 +33,7 @@ LIVE_LABELS = tuple(
 
 
 class PageServer(ThreadingHTTPServer):
-    """Answers each browser in a thread of its own, so that a slow one holds up nobody.
-
-    port: 0 for a free one; raises OSError. kept: portions of curves for who has asked last so long
-    ago.
-    """
+    """Answers each browser in a thread of its own, so that a slow one holds up nobody."""
 
     daemon_threads = True
 
@@ -50,7 +46,7 @@ class PageServer(ThreadingHTTPServer):
         self._lock = Lock()
 
     def add(self, state: object, portion: object) -> None:
-        """Have this ready for whoever asks: what the page says, and the newest points of curves."""
+        """Have this ready for whoever asks; portion: the newest points of curves."""
         texts = [json.dumps(each, separators=(',', ':'), allow_nan=False)
                  for each in (state, portion)]
         with self._lock:
@@ -58,7 +54,6 @@ class PageServer(ThreadingHTTPServer):
             self._portions.append(texts[1])
 
     def frame(self, known: int) -> str:
-        """The state and the portions that somebody is missing who has so many, as JSON."""
         with self._lock:
             first = len(self._portions) - self._count + known if known <= self._count else 0
             missing = ','.join(list(self._portions)[max(first, 0):])
@@ -134,7 +129,6 @@ class LiveNode(ProcessNode):
         self._server.shutdown()
 
     def _points_of(self, state: followed.ControllerState) -> dict[str, list[object]]:
-        """What has come of each curve: time of arrival [s] and value."""
         points: dict[str, list[object]] = {}
         for label, at_ns, value in state.watched:
             points.setdefault(label, []).append((self._seconds(at_ns), rounded(value)))
@@ -150,7 +144,6 @@ def rounded(value: float) -> float | None:
 
 
 def content_of(state: followed.ControllerState, now_s: float) -> dict[str, object]:
-    """What the page says of a controller in words and numbers. now_s: on the steady clock."""
     return {
         'name': state.name, 'word': state.word(now_s), 'message': state.message,
         # Nobody knows how somebody is who says nothing any more.

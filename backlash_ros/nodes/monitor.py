@@ -140,10 +140,7 @@ class MonitorNode(ProcessNode):
 
 
 def bar(value: float, half_width: float, scale: float, width: int) -> str:
-    """A bar from 0 to |value| on an axis that ends at `scale`, its band in another shade.
-
-    Empty where value or scale is nothing to draw. A band that is there takes a column at least.
-    """
+    """A bar from 0 to |value| on an axis that ends at `scale`, its band in another shade."""
     if not isfinite(value) or not scale > 0.0:
         return ' ' * width
     half = 0.0 if isnan(half_width) else half_width
@@ -168,10 +165,7 @@ def screen(
     states: Sequence[ControllerState], selected: int, notice: str, now_s: float, width: int,
     height: int,
 ) -> Group:
-    """All controllers; where there is no room, all but the selected one in a line each.
-
-    notice: in place of the keys. now_s: on the steady clock. width, height: of the terminal.
-    """
+    """All controllers; where there is no room, all but the selected one in a line each."""
     panel_lines = 10  # lines of a controller without events, its frame included
     several = len(states) > 1
     keys = 'f freeze/learn  c compensate  r reset  s save  q quit'
@@ -203,7 +197,6 @@ def plain_line(state: ControllerState, now_s: float) -> str:
 def _panel(
     state: ControllerState, now_s: float, width: int, events: int, chosen: bool,
 ) -> Panel:
-    """One controller in a frame. events: how many of the newest ones."""
     inner, values, number = width - 4, state.values, state.number
     colour = 'red' if state.silent_s(now_s) else ('green', 'yellow', 'red')[state.level]
     # Often the cure stands in the second line.
@@ -239,10 +232,7 @@ def _with_band(state: ControllerState, name: str, width: int = 0) -> str:
 
 @contextmanager
 def pressed_keys() -> Iterator[Callable[[], str]]:
-    """A function that returns what was pressed since its last call; nothing but on a terminal.
-
-    Ctrl-C still is a signal. The terminal is left as it was found.
-    """
+    """A function that returns what was pressed since its last call, on a terminal."""
     if not sys.stdin.isatty():
         yield lambda: ''
         return

@@ -26,11 +26,9 @@ from backlash_ros.nodes.runtime.process import ProcessNode, emit, run
 class PlantNode(ProcessNode):
     """Publishes y(k) and applies the newest v, which causes y(k+1) together with the state.
 
-    Real time: every sample period; where no new v has come, the old one is held. Where the
-    process is held up, the plant goes on with the newest v and the outputs that come too late are
-    left out. Lockstep: as soon as v(k) is there; /clock tells the simulated time before every
-    output. An output that is lost on purpose has no tick of /clock either: there is nothing else
-    by which simulated time could show the gap.
+    Real time: every sample period; what comes too late, because the process was held up, is left
+    out. Lockstep: as soon as v(k) is there; /clock tells the simulated time before every output.
+    An output that is lost on purpose has no tick of /clock, which shows the gap.
     """
 
     def __init__(self) -> None:
@@ -116,10 +114,7 @@ class PlantNode(ProcessNode):
         self._end_sample()
 
     def _keep_time(self, executor: PromptExecutor) -> None:
-        """Real time: advance and publish y every period, at absolute deadlines.
-
-        In between messages are served, and all else after y has left.
-        """
+        """Real time: advance and publish y at absolute deadlines, all else after y has left."""
         period_ns = self.settings.sample_period * 1e9
         start, tick = time.monotonic_ns(), -1
         while not (self.stopping or self._complete):

@@ -37,7 +37,7 @@ RECORDER_DEPTH = 10_000  # messages that may wait while the disk is slow
 
 @dataclass
 class RecordedTopic:
-    """A recorded topic, with namespace and remappings in its name, and its counts of messages."""
+    """A recorded topic under its full name, and its counts of messages."""
 
     name: str
     connection: Connection | None = None
@@ -54,12 +54,9 @@ def _row(topic: str, message: bytes) -> dict[str, float]:
 
 
 class RecorderNode(ProcessNode):
-    """Writes messages as they came, stamped with the time at which they left their node.
+    """Writes messages as they came, stamped with the time (in lockstep simulated) of departure.
 
-    In lockstep the stamp is the simulated time. Without a bag it only tells the progress, which
-    is also what it goes on with when the disk takes no more.
-
-    failure: why the recording has stopped before its time, empty if it has not.
+    Without a bag it tells the progress alone, as where the disk takes no more: failure says why.
     """
 
     def __init__(self) -> None:

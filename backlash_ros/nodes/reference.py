@@ -24,10 +24,9 @@ from backlash_ros.nodes.runtime.process import ProcessNode, emit, run
 
 
 class ReferenceNode(ProcessNode):
-    """Publishes y_m for the sample that comes next.
+    """Publishes y_m for the sample that comes next, as ReferencePace says after plant_output.
 
-    plant_output is the sampling clock, see ReferencePace; a node that waits for its subscribers
-    stays at y_m(0) before the first output, so that the run begins at t = 0. In lockstep y_m
+    A node that waits for its subscribers stays at y_m(0) before the first output. In lockstep y_m
     leaves once per tick of /clock.
     """
 

@@ -69,7 +69,6 @@ class Joint:
 
     @property
     def state(self) -> object:
-        """Of which every change is worth a message in /diagnostics."""
         return self.loop and (self.loop.phase, self.loop.estimate.status)
 
     def check_change(self, p: Parameters) -> None:
@@ -83,10 +82,7 @@ class Joint:
             )
 
     def save(self) -> Future[str] | None:
-        """Begin to save the estimates; None where there is nothing worth it, or nowhere to.
-
-        The result says why it failed, empty if it did not.
-        """
+        """Begin to save the estimates, if worth it; the result says why it failed, if it did."""
         p, estimate = self.p, self.loop.estimate if self.loop else None
         if estimate is None or not p.estimates.file or not worth_saving(estimate):
             return None
@@ -143,7 +139,6 @@ class Joint:
         publish(worst, {**details, **values}, logs)
 
     def close(self) -> None:
-        """Wait until everything is written, and say in the log what was counted."""
         self._writer.shutdown()
         if self.loop is not None:
             said = ', '.join(
@@ -165,7 +160,6 @@ def counts_of(loop: ControlLoop) -> dict[str, int]:
 
 
 def values_of(loop: ControlLoop, timing: Timing) -> dict[str, object]:
-    """Counts, estimates and what tells how well the loop runs."""
     e, law, swing = loop.estimate, loop.core.estimator, loop.statistics.swing()
     gap, report, redesign = e.c_r - e.c_l, law.report, loop.core.redesign
     p50_ms, p99_ms = loop.statistics.latencies_ms(0.5, 0.99)
@@ -211,7 +205,6 @@ def _peers_on(
     to: DriverTopics, topic: str, infos: list[TopicEndpointInfo],
     offered: QoSProfile | None = None, wanted: QoSProfile | None = None,
 ) -> diagnosis.TopicFigures:
-    """Who is on a topic, and what the node itself offers to them or wants of them."""
     wanted_type = name_of_type(to.types[topic])
 
     def peer(info: TopicEndpointInfo) -> diagnosis.Peer:

@@ -26,10 +26,9 @@ Row = tuple[float, ...]
 
 
 class WatchPublisher:
-    """Publishes `controller/watch/<label>` for each label of which there is a subscriber.
+    """Publishes `controller/watch/[<joint>/]<label>` for each label that is subscribed to.
 
-    Of a joint that has a name: `controller/watch/<joint>/<label>`. After v(k) comes the u that it
-    led to, which is known with y(k+1): points of their loop. heard: labels with a subscriber.
+    After v(k) comes the u that it led to, known with y(k+1): points of their loop.
     """
 
     PERIOD_S = 0.04  # between two messages of a topic; a loop at 1 kHz has no time for many more
@@ -45,7 +44,6 @@ class WatchPublisher:
         self._u_waits = False  # for the sample after that of the newest v
 
     def look(self) -> None:
-        """Look who listens."""
         self.heard = [
             label for label, publisher in self._publishers.items()
             if publisher.get_subscription_count()
@@ -82,10 +80,8 @@ def watched_values(signals: Row, estimates: Row) -> dict[str, float]:
 class StepPublisher:
     """The topics ~/signals, ~/estimates and those below ~/watch.
 
-    The rows of several joints are one after the other, with the joint before each label; that of a
-    joint without a step is nan. Nothing is made that nobody listened to at the newest look.
-
-    heard: whether anybody did.
+    The rows of several joints stand one after the other; that of a joint without a step is nan.
+    heard: whether anybody listened at the newest look: nothing is made for nobody.
     """
 
     heard = True
@@ -102,7 +98,6 @@ class StepPublisher:
 
     @property
     def listeners(self) -> int:
-        """How many subscribers there are to every step."""
         return min(publisher.listeners for publisher in self._rows)
 
     def look(self) -> None:
@@ -112,7 +107,6 @@ class StepPublisher:
             or any(watch.heard for watch in self._watches.values())
 
     def publish(self, loops: Mapping[str, ControlLoop], steps: Mapping[str, ControlStep]) -> None:
-        """Tell of the steps of a sample."""
         if self.heard:
             rows = {joint: _rows(loop, steps.get(joint)) for joint, loop in loops.items()}
             for publisher, row in zip(self._rows, zip(*rows.values(), strict=True), strict=True):
@@ -134,8 +128,7 @@ def _rows(loop: ControlLoop, step: ControlStep | None) -> tuple[Row, Row]:
 class ModelPublisher:
     """Publishes `controller/model` when G has changed, else once per second of samples.
 
-    Counted in samples, so that a run in lockstep is the same whenever it is made. A message is
-    about one joint, whose name is part of the labels.
+    These are counted, so that a run in lockstep is the same whenever it is made.
     """
 
     def __init__(self, node: Node, joint: str) -> None:
@@ -150,7 +143,6 @@ class ModelPublisher:
         self._told: tuple[StateModel | None, float] = None, -inf
 
     def follow(self, loop: ControlLoop, p: Parameters) -> None:
-        """Publish after a sample, if it is time."""
         learned, index, (told, told_index) = \
             loop.core.estimator.learned_model, loop.counter.index, self._told
         # Deviations and noise change with every few samples, and are of use to a reader.

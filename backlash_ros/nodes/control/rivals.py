@@ -27,12 +27,11 @@ ENDPOINT, SINCE = 'endpoint of control', 'active since [ns]'
 
 
 class Presence:
-    """Makes a publisher of a topic known to all of this machine as long as the socket is open.
+    """Makes a publisher of a topic known to all of this machine; discovery may take seconds.
 
-    Discovery may take seconds. Every controller therefore holds a Unix socket in the abstract
-    namespace of Linux, named after domain, topic and the identity of its publisher. The kernel
-    lists these names, and takes a name back with its process, however that ends. Processes in
-    containers see each other if they share the network.
+    Every controller holds a Unix socket in the abstract namespace of Linux, named after domain,
+    topic and the identity of its publisher. The kernel lists these names, and takes a name back
+    with its process, however that ends.
     """
 
     def __init__(self, domain: int, topic: str, identity: str) -> None:
@@ -45,7 +44,6 @@ class Presence:
             self.socket.bind(f'\0{self._prefix[1:]}{identity}')
 
     def others(self) -> frozenset[str]:
-        """Identities of the other publishers."""
         try:
             listed = Path('/proc/net/unix').read_text().splitlines()
         except OSError:
@@ -62,14 +60,11 @@ class Rival(NamedTuple):
 
 
 class Rivals:
-    """Tells who of several publishers was first, from what each of them can know.
+    """Tells who of several publishers was first, by the time and identity in /diagnostics.
 
-    Controllers say in /diagnostics since when they are active; equal times are ordered by the
-    identity of the publisher. Whoever says nothing of the kind was first if it was there when this
-    controller became active. A controller that is not active, or has fallen silent, is no rival.
-
-    since_ns: since when this controller is active, 0 if it is not. settled_at: when it has found
-    who was there already, on the steady clock as all other times [s].
+    Whoever says nothing of the kind was first if it was there when this controller became active.
+    A controller that is not active, or has fallen silent, is no rival. since_ns: 0 while inactive.
+    settled_at: when all are found that were there already, on the steady clock [s].
     """
 
     def __init__(self, own: str, settled_at: float) -> None:
@@ -80,11 +75,9 @@ class Rivals:
         self._claims: dict[str, tuple[int, float]] = {}
 
     def begin(self, since_ns: int, now: float) -> None:
-        """The controller has become active; since 0: it has ceased to be."""
         self.since_ns, self._active_at = since_ns, now if since_ns else inf
 
     def hear(self, values: Mapping[str, str], now: float) -> None:
-        """Take in what a node says in /diagnostics."""
         identity, since = values.get(ENDPOINT, ''), values.get(SINCE, '')
         if identity and identity != self.own and since.isdecimal():
             self._claims[identity] = int(since), now
@@ -107,9 +100,8 @@ class Rivals:
 class RivalWatch:
     """Looks out for other publishers of the command while the node runs.
 
-    advertise: makes the own publisher. changed: called when there is something new to say.
-    found: the rivals at the newest look. awaited: controllers of this machine that were there at
-    activation and are not found yet, however long it takes.
+    changed: called when there is something new to say. found: the rivals at the newest look.
+    awaited: controllers of this machine that were there at activation and are not found yet.
     """
 
     def __init__(
@@ -133,23 +125,19 @@ class RivalWatch:
 
     @property
     def settled(self) -> bool:
-        """Whether the time is over in which those who were there before the node are found."""
         return time.monotonic() >= self._rivals.settled_at
 
     @property
     def claim(self) -> dict[str, object]:
-        """What the node has to say in /diagnostics."""
         return {ENDPOINT: self._rivals.own, SINCE: self._rivals.since_ns}
 
     def begin(self, active: bool) -> None:
-        """The controller has become active, or has ceased to be."""
         # Of two that begin at once the one that is listed later waits for the other at least.
         self.awaited = self.presence.others() if active else frozenset()
         self._rivals.begin(time.time_ns() if active else 0, time.monotonic())
         self.look()
 
     def look(self) -> None:
-        """Look at the graph."""
         now, before, node = time.monotonic(), self.found, self._node
         # Counting is ten times cheaper than asking who they are.
         infos = node.get_publishers_info_by_topic(self.topic) \
@@ -182,7 +170,6 @@ class RivalWatch:
 
 
 def name_of(info: TopicEndpointInfo) -> str:
-    """Full name of the node that an endpoint belongs to."""
     # Names are discovered a little later than topics, and programs without ROS have none.
     if not info.node_name or 'UNKNOWN' in info.node_name:
         return UNNAMED

@@ -42,7 +42,6 @@ class DriverTopics(NamedTuple):
 
 
 def driver_topics(p: Parameters) -> DriverTopics:
-    """The topics and types that io.style, io.command and joints ask for."""
     of_joints = bool(p.joints) or p.io.style == 'joint_state_topic'
     commands = topics.JOINT_COMMANDS if p.io.command == 'array' else topics.JOINT_STATE_COMMANDS
     names = (*{
@@ -73,20 +72,17 @@ def check_style(p: Parameters) -> None:
 
 
 def output_qos(p: Parameters, depth: int) -> QoSProfile:
-    """How y is listened to."""
     return QoSProfile(depth=depth, reliability=(
         ReliabilityPolicy.BEST_EFFORT if p.io.best_effort else ReliabilityPolicy.RELIABLE
     ))
 
 
 class DriverIo:
-    """What a node says to the driver and hears from it.
+    """What a node says to the driver and hears from it, by joint.
 
-    Joints are told apart by name; the only one of a controller without `joints` is nameless, and
-    io.joint says what it is called in messages.
-
+    The only joint of a controller without `joints` is nameless; io.joint is its name in messages.
     skipped: messages in a row without a joint. seen: the joints of the newest of these.
-    simulated_time: whether stamps are those of /clock. publisher: of v, once it is advertised.
+    simulated_time: whether stamps are those of /clock.
     """
 
     publisher: Publisher
@@ -109,17 +105,15 @@ class DriverIo:
         return self._node.count_publishers(topics.TRUTH) > 0
 
     def now_ns(self) -> int:
-        """Time on the clock of the stamps."""
         # time.time_ns() is the system clock of ROS, without the detour.
         return self._node.get_clock().now().nanoseconds if self.simulated_time \
             else time.time_ns()
 
     def stamp_ns(self, info: dict[str, Any]) -> int:
-        """When a message left, on the clock of the stamps."""
+        """When a message left."""
         return self.now_ns() if self.simulated_time else int(info['source_timestamp'])
 
     def known_of(self, timing: Timing) -> Timing:
-        """What the stamps of the messages tell of the driver."""
         # Those of simulated time have nothing to do with the time of arrival.
         age_s = nan if self.simulated_time else timing.age_s
         return timing._replace(age_s=age_s, repeats_stamps=self._repeats_stamps)
@@ -197,7 +191,6 @@ class DriverIo:
 
     @property
     def has_reports(self) -> bool:
-        """Whether the driver reports what it has applied."""
         reports = self._heard.get('reports')
         return reports is not None and reports.get_publisher_count() > 0
 
@@ -220,7 +213,6 @@ class DriverIo:
         return {joint: found[joint or own] for joint in names if (joint or own) in found}
 
     def advertise(self) -> Publisher:
-        """Make the publisher of v."""
         topic = self.topics.control
         self.publisher = self._node.create_publisher(self.topics.types[topic], topic, DEPTH)
         return self.publisher

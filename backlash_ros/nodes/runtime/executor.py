@@ -20,10 +20,7 @@ WITH_INFO = Subscription.CallbackType.WithMessageInfo
 
 
 class Polled(MutuallyExclusiveCallbackGroup):
-    """Of subscriptions that PromptExecutor does not serve: their messages wait for serve_polled.
-
-    To take a message costs a tenth of what it costs to be woken up by it.
-    """
+    """Of subscriptions whose messages wait for serve_polled: a tenth of the cost of a wake-up."""
 
 
 def serve_polled(subscription: Subscription) -> None:
@@ -39,10 +36,9 @@ def serve_polled(subscription: Subscription) -> None:
 class PromptExecutor(SingleThreadedExecutor):
     """Serves the subscriptions of one node at once, all else after them.
 
-    The executor of rclpy makes a new wait set of every service, timer and event for each single
-    message, which takes longer than to answer it. This one keeps a wait set of its own for what is
-    urgent, calls timers when they are due, and five times a second leaves the rest to rclpy. It
-    wakes up as often, for signals.
+    The executor of rclpy makes a new wait set of everything for each message, which takes longer
+    than to answer it. This one keeps one of the urgent, calls timers when they are due, and five
+    times a second leaves the rest to rclpy. It wakes up as often, for signals.
     """
 
     def __init__(self, node: Node) -> None:
@@ -57,7 +53,6 @@ class PromptExecutor(SingleThreadedExecutor):
         self._look_at_ns = self._rclpy_at_ns = 0  # when timers are due, and all else
 
     def can_execute(self, entity: Any) -> bool:
-        """Whether rclpy is to serve it."""
         return not isinstance(entity, (Subscription, Timer)) and bool(super().can_execute(entity))
 
     def shutdown(self, timeout_sec: float | None = None) -> bool:
@@ -65,10 +60,7 @@ class PromptExecutor(SingleThreadedExecutor):
         return bool(super().shutdown(timeout_sec))
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
-        """Serve one message of each topic and what else is due; may return before the timeout.
-
-        timeout_sec: how long to wait for something to do; None waits until the next look.
-        """
+        """Serve one message of each topic and what else is due; waits until the next look at most."""
         wait_ns = self._look_at_ns - time.monotonic_ns()
         if timeout_sec is not None:
             wait_ns = min(wait_ns, int(timeout_sec * 1e9))
@@ -125,7 +117,6 @@ class PromptExecutor(SingleThreadedExecutor):
         self._look_at_ns = min(now + max(wait_ns, 0), self._rclpy_at_ns)
 
     def _serve_rest(self) -> bool:
-        """Let rclpy serve one thing that is ready; return whether there was any."""
         while True:
             try:
                 handler, _, _ = self.wait_for_ready_callbacks(timeout_sec=0.0)

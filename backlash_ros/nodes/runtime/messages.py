@@ -53,7 +53,6 @@ class LabelledArrayPublisher:
         return self._publisher.get_subscription_count()
 
     def publish(self, row: Sequence[float]) -> None:
-        """Publish one value per label, if anybody listens."""
         if self.listeners:
             # An array is taken as it is; a list would be checked element by element.
             self._message.data = array('d', row)
@@ -61,10 +60,7 @@ class LabelledArrayPublisher:
 
 
 class DiagnosticsPublisher:
-    """Publishes the state of one node to /diagnostics, and its changes to the log.
-
-    hardware_id: what the node has to do with. part: what of the node it is about, empty for all.
-    """
+    """Publishes the state of a node, or a part of it, to /diagnostics, and changes to the log."""
 
     def __init__(self, node: Node, hardware_id: str, part: str = '') -> None:
         self._node, self._prefix = node, f'{part}: ' if part else ''
@@ -139,7 +135,6 @@ class JointReader:
         self._name: tuple[str, ...] = ()
 
     def read(self, message: bytes) -> JointMessage:
-        """What a sensor_msgs/JointState holds."""
         order = '<' if message[1] & 1 else '>'
         seconds, nanoseconds = unpack_from(order + 'iI', message, 4)
         at = 12 + len(self._head)

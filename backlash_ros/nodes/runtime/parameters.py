@@ -42,10 +42,7 @@ class ParameterNode(Node):
         """Use the settings, which have changed."""
 
     def declare_settings(self, executable: str, reconfigurable: bool) -> None:
-        """Declare what the table says this executable uses; raises ParameterError.
-
-        reconfigurable: whether all but the fixed ones may change while the node is unconfigured.
-        """
+        """Declare what the table says of this executable; reconfigurable: while unconfigured."""
         # rclpy has no other way to ask for all names that were given; two are declared by itself.
         given = {
             name: _given_value(parameter)
@@ -83,8 +80,7 @@ class ParameterNode(Node):
     def set_parameters_atomically(self, parameter_list: list[RosParameter]) -> SetParametersResult:
         """Set what differs from the present values, in the declared types.
 
-        Command-line tools send 1e-6 as a text and [1, 2] as integers, and load whole files in which
-        most values are the present ones, also of parameters that cannot change.
+        Command-line tools send 1e-6 as a text, and load whole files of mostly present values.
         """
         changes, values = [], {}
         try:
@@ -116,7 +112,6 @@ class ParameterNode(Node):
 
 
 def _given_value(parameter: RosParameter) -> object:
-    """The value that somebody has given; rcl reads an empty list as no value at all."""
     if parameter.value is not None:
         return parameter.value
     entry = entry_of(parameter.name)
@@ -133,10 +128,7 @@ def _ros_parameter(name: str, value: Value, entry: Parameter) -> RosParameter:
 
 
 def complaints(arguments: Sequence[str], executable: str, full_name: str) -> Iterator[str]:
-    """A sentence for each section of the given files that was probably meant for this node.
-
-    ROS 2 passes over a section whose name is not that of the node, without a word.
-    """
+    """What to do for each section of given files that ROS 2 passes over without a word."""
     for option, file in pairwise(arguments):
         if option == '--params-file':
             import yaml  # most nodes start without a file
@@ -151,8 +143,7 @@ def complaints(arguments: Sequence[str], executable: str, full_name: str) -> Ite
 def unused(sections: Sequence[str], executable: str, full_name: str) -> list[str]:
     """Sections that do not reach the node though they seem to be meant for it.
 
-    None where another one of its name does. Where node and section both have a namespace, that of
-    the section may be another axis.
+    None where another one of its name does. A section with a namespace may be another axis.
     """
     *namespace, own = full_name.strip('/').split('/')
     meant = []

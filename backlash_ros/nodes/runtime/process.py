@@ -92,10 +92,7 @@ class ProcessNode(ParameterNode):
         callback: Callable[[Any, dict[str, Any]], None], qos: QoSProfile | int, raw: bool = False,
         polled: bool = False,
     ) -> Subscription:
-        """Subscribe with a callback that also gets the times and the number of the message.
-
-        polled: it is called by serve_polled alone.
-        """
+        """Subscribe with times and number of the message; polled: called by serve_polled alone."""
         # rclpy takes such callbacks but does not say so in its types.
         untyped: Any = callback
         group: Any = Polled
@@ -184,9 +181,8 @@ def exit_at_the_latest(within_s: float, code: int) -> Iterator[None]:
     """End the process with this exit code where the block takes longer than within_s [s].
 
     Fast DDS 2.14 hangs for good in one of some hundreds of exits of participants that leave
-    together (DomainParticipant::set_listener spins), with the interpreter locked: no thread of
-    Python and no handler of a signal would run. All work is done by then, so a timer of the C
-    library ends the process instead.
+    together, with the interpreter locked: no thread of Python and no handler of a signal would
+    run. All work is done by then, so a timer of the C library ends the process instead.
     """
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError):  # nobody may be reading any more
