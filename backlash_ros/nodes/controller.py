@@ -212,20 +212,18 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
 
     def _send_last(self, loops: JointLoops) -> None:
         """Send what ends all loops; v is held where that takes too long, or SIGKILL comes next."""
-        p, told = self.settings, time.monotonic()
-        longest_s, step_s = p.timeout.ramp, max(p.sample_period, 1e-3)
-        deadline, cut_short = told + longest_s, ''
+        p, told, cut_short = self.settings, time.monotonic(), False
+        step_s, deadline = max(p.sample_period, 1e-3), told + p.timeout.ramp
         while loops.send_next():
-            if not cut_short:
-                if SIGTERM in self.signals[1:]:
-                    cut_short = 'SIGTERM came before it reached zero'
-                elif time.monotonic() + step_s > deadline:
-                    cut_short = f'it did not reach zero within timeout.ramp={longest_s:g} s'
-                if cut_short:
-                    for loop in loops.end('hold'):
-                        if loop.v != loop.core.limits.zero:
-                            self.log.warning(f'v={loop.v:.6g} is held: {cut_short}')
-                    continue
+            late = time.monotonic() + step_s > deadline
+            if not cut_short and (late or SIGTERM in self.signals[1:]):
+                cut_short, why = True, f'timeout.ramp={p.timeout.ramp:g} s' if late else 'SIGTERM'
+                for loop in loops.end('hold'):
+                    if loop.v != loop.core.limits.zero:
+                        self.log.warning(
+                            f'v={loop.v:.6g} is held: {why} came before it reached zero'
+                        )
+                continue
             time.sleep(step_s)
             if time.monotonic() > told + DIAGNOSTICS_PERIOD_S:
                 told = time.monotonic()

@@ -24,7 +24,6 @@ from std_msgs.msg import Float64MultiArray
 from backlash_ros import topics
 from backlash_ros.bags import REPAIR_COMMAND, Bag, RecordingError, repair_command
 from backlash_ros.core.loop.diagnosis import Finding, Level
-from backlash_ros.core.loop.sample_counter import UNNUMBERED
 from backlash_ros.core.parameters import RECORDER
 from backlash_ros.nodes.runtime import messages
 from backlash_ros.nodes.runtime.driver_io import driver_topics, output_qos
@@ -37,15 +36,15 @@ RECORDER_DEPTH = 10_000  # messages that may wait while the disk is slow
 
 @dataclass
 class RecordedTopic:
-    """A recorded topic under its full name, and its counts of messages."""
-
-    name: str
+    subscription: Subscription
     connection: Connection | None = None
     newest: bytes = b''  # serialised
     received: int = 0
     recorded: int = 0
-    missed: int = 0
-    sequence: int = UNNUMBERED  # of the newest message
+
+    @property
+    def name(self) -> str:
+        return str(self.subscription.topic_name)
 
 
 def _row(topic: str, message: bytes) -> dict[str, float]:
@@ -70,16 +69,14 @@ class RecorderNode(ProcessNode):
                       'started: nothing is recorded, as the parameter bag names no folder')
         to = driver_topics(p)
         # y comes last of all: it starts the loop.
-        recorded = {
+        for topic, kind in {
+            **dict.fromkeys(topics.LABELS_OF, Float64MultiArray),
+            topics.DIAGNOSTICS: DiagnosticArray,
+            **{topic: to.types[topic] for topic in (to.reference, to.applied, to.control)},
+        }.items():
             # A G that was learned before this recorder came belongs into the bag as well.
-            topic: self._record(
-                topic, kind, messages.KEPT_QOS if topic == topics.MODEL else RECORDER_DEPTH
-            ) for topic, kind in {
-                **dict.fromkeys(topics.LABELS_OF, Float64MultiArray),
-                topics.DIAGNOSTICS: DiagnosticArray,
-                **{topic: to.types[topic] for topic in (to.reference, to.applied, to.control)},
-            }.items()
-        }
+            kept = topic == topics.MODEL
+            self._record(topic, kind, messages.KEPT_QOS if kept else RECORDER_DEPTH)
         if p.lockstep:
             self.create_subscription(Clock, topics.CLOCK, self._on_clock, RECORDER_DEPTH)
         if ENABLED:
@@ -94,7 +91,7 @@ class RecorderNode(ProcessNode):
 
         self.call_when(
             lambda: not p.wait_for_publishers or all(
-                recorded[topic].get_publisher_count() for topic in wanted
+                self._channels[topic].subscription.get_publisher_count() for topic in wanted
             ), start, ', '.join(wanted),
         )
 
@@ -114,16 +111,6 @@ class RecorderNode(ProcessNode):
             self.log.info(
                 f'recorded {bag.saved} messages of {bag.saved_ns * 1e-9:.1f} s to {bag.path}'
             )
-            output = self._channels.get(driver_topics(self.settings).output)
-            if self._first_signals and not (output and output.recorded):
-                self._complain(
-                    'the bag holds no output of the driver, which the controller has heard: the '
-                    'recorder did not discover its publisher before the end; let the driver wait '
-                    'until its output has two subscribers, or run longer'
-                )
-        for channel in channels:
-            if channel.missed:
-                self.log.warning(f'{channel.missed} messages of {channel.name} were missed')
         if self.failure:
             unrecorded = self._received - sum(channel.recorded for channel in channels)
             self.log.warning(f'{unrecorded} messages came after the recording had stopped')
@@ -132,10 +119,6 @@ class RecorderNode(ProcessNode):
     @property
     def _received(self) -> int:
         return sum(channel.received for channel in self._channels.values())
-
-    def _complain(self, text: str) -> None:
-        self.log.error(text)
-        emit('complaint', text=text)
 
     def _open_bag(self, path: str, storage: str) -> Bag:
         bag = Bag(path, storage)
@@ -172,29 +155,24 @@ class RecorderNode(ProcessNode):
                 f'{bag.saved_ns * 1e-9:.1f} s; all else goes on. Make room, then: '
                 f'{REPAIR_COMMAND} {bag.path}'
             )
-            self._complain(self.failure)
+            self.log.error(self.failure)
+            emit('complaint', text=self.failure)
             return False
 
-    def _record(self, topic: str, message_type: type[Any], qos: QoSProfile | int) -> Subscription:
-        subscription = self.listen(
-            message_type, topic, partial(self._on_message, topic), qos, raw=True
+    def _record(self, topic: str, message_type: type[Any], qos: QoSProfile | int) -> None:
+        channel = self._channels[topic] = RecordedTopic(
+            self.listen(message_type, topic, partial(self._on_message, topic), qos, raw=True)
         )
-        channel = self._channels[topic] = RecordedTopic(str(subscription.topic_name))
 
         def announce(bag: Bag) -> None:
             channel.connection = bag.add_topic(channel.name, messages.name_of_type(message_type))
 
         self._with_bag(announce)
-        return subscription
 
     def _on_message(self, topic: str, message: bytes, info: dict[str, Any]) -> None:
-        channel, sequence = self._channels[topic], info['publication_sequence_number']
+        channel = self._channels[topic]
         channel.received += 1
         channel.newest = message
-        # Each of several publishers has numbers of its own.
-        if UNNUMBERED not in (sequence, channel.sequence) and topic != topics.DIAGNOSTICS:
-            channel.missed += max(sequence - channel.sequence - 1, 0)
-        channel.sequence = sequence
         if (connection := channel.connection) is not None:
             stamp_ns = info['source_timestamp'] if self._now_ns is None else self._now_ns
             channel.recorded += self._with_bag(lambda bag: bag.write(connection, stamp_ns, message))

@@ -60,7 +60,7 @@ class PromptExecutor(SingleThreadedExecutor):
         return bool(super().shutdown(timeout_sec))
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
-        """Serve one message of each topic and what else is due; waits until the next look at most."""
+        """Serve one message of each topic and what else is due; wait for the next look at most."""
         wait_ns = self._look_at_ns - time.monotonic_ns()
         if timeout_sec is not None:
             wait_ns = min(wait_ns, int(timeout_sec * 1e9))

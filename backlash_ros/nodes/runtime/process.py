@@ -29,7 +29,7 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from rclpy.utilities import remove_ros_args
 
-from backlash_ros.core.parameters import BY_NAME, ParameterError, as_yaml
+from backlash_ros.core.parameters import BY_NAME, UNTOLD, ParameterError, as_yaml
 from backlash_ros.middleware import prefer_loopback
 from backlash_ros.nodes.runtime.executor import Polled, PromptExecutor
 from backlash_ros.nodes.runtime.parameters import ParameterNode, complaints
@@ -56,10 +56,6 @@ def ros_arguments(arguments: Sequence[str]) -> list[str]:
         if inside:
             found.append(argument)
     return found
-
-
-class InitialisationError(RuntimeError):
-    """ROS cannot begin with these arguments: the message says why."""
 
 
 class ProcessNode(ParameterNode):
@@ -112,8 +108,7 @@ class ProcessNode(ParameterNode):
         self, condition: Callable[[], bool], action: Callable[[], None], awaited: str,
     ) -> None:
         """Call action as soon as condition holds; `awaited` says in the log what is missing."""
-        remind_period_s = 5.0
-        remind = time.monotonic() + remind_period_s
+        remind = time.monotonic() + 5.0
 
         def look() -> None:
             nonlocal remind
@@ -121,7 +116,7 @@ class ProcessNode(ParameterNode):
                 self.destroy_timer(timer)
                 action()
             elif time.monotonic() > remind:
-                remind += remind_period_s
+                remind += 5.0
                 self.log.info(f'waiting for {awaited}')
 
         timer = self.every(0.01, look)
@@ -145,7 +140,7 @@ def run(
             _initialise(arguments)
             _refuse_plain_arguments(executable, make_node, arguments)
             node = make_node()
-        except (ParameterError, NameValidationException, InitialisationError) as error:
+        except (ParameterError, NameValidationException) as error:
             print(f'{executable}: {" ".join(str(error).split())}', file=sys.stderr)
             return BAD_INPUT
         for complaint in complaints(arguments, executable, node.get_fully_qualified_name()):
@@ -213,7 +208,7 @@ def _initialise(arguments: list[str]) -> None:
         reason = str(error).split(', at /')[0]
         if 'Sequence should be of same type' in reason:
             reason += ': write all numbers of a list with a decimal point'
-        raise InitialisationError(reason) from None
+        raise ParameterError('ROS', UNTOLD, f'cannot begin: {reason}') from None
     finally:
         if get_logger_level('rcl') == LoggingSeverity.FATAL:
             set_logger_level('rcl', LoggingSeverity.UNSET)
