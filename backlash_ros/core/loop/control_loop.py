@@ -93,7 +93,7 @@ class ControlLoop:
         self.knows_v = v is not None
         if v is not None:
             self.core.motion = at_rest(v)
-        self._p, self._send, self._driver = p, send, driver
+        self.driver, self._p, self._send = driver, p, send
         self._gap = NEXT_SAMPLE  # what is missing since the newest output that was used
         self._ending: Iterator[float] = iter(())  # commands that lead v to its end
 
@@ -115,11 +115,6 @@ class ControlLoop:
         return self.core.motion.v
 
     @property
-    def unreferred_s(self) -> float:
-        """Since the newest reference [s], nan before the first."""
-        return self._driver.steady_s() - self.heard.y_m_at
-
-    @property
     def begins(self) -> bool:
         return self.phase in (Phase.BEGINS, Phase.SILENT)
 
@@ -137,7 +132,7 @@ class ControlLoop:
     def take_reference(self, y_m: float) -> None:
         """Take in a reference; an absurd one is counted and the last one holds."""
         if plausible(y_m):
-            self.heard.y_m, self.heard.y_m_at = y_m, self._driver.steady_s()
+            self.heard.y_m, self.heard.y_m_at = y_m, self.driver.steady_s()
         else:
             self.statistics.bad_references += 1
 
@@ -179,7 +174,7 @@ class ControlLoop:
                 self.core.motion = Motion(v, v - self.v, v)
             self.knows_v = True
             self._send(v)
-            self.commands.publish(v, self._driver.now_ns())
+            self.commands.publish(v, self.driver.now_ns())
 
     def _is_usable(self, output: Output, arrival: Arrival, y_m: float) -> bool:
         """Count a message of y; returns whether there is a command to be made of it."""
@@ -191,7 +186,7 @@ class ControlLoop:
         if arrival is not NEXT_SAMPLE:
             self._note_missing(arrival)
         if plausible(output.y):
-            self.heard.y_at = self._driver.steady_s()
+            self.heard.y_at = self.driver.steady_s()
             if plausible(y_m):
                 return self._may_answer(output)
             statistics.without_reference += 1
@@ -218,14 +213,14 @@ class ControlLoop:
         too_long = self.phase is Phase.RUNS and (gap.missing > LONGEST_GAP or stalled)
         if self.silent or gap.restarted or too_long:
             self.statistics.interruptions += 1
-            self._happens(Event.INTERRUPTION)
+            self.phase = Event.INTERRUPTION.after(self.phase)
             self.commands.origin.restart()
-            self._renew_core(self.estimate)
+            self.renew(self.estimate)
         return self.phase is Phase.RUNS or p.lockstep or self._may_begin(output)
 
     def _may_begin(self, output: Output) -> bool:
         """Whether it is known from which v the first command goes on, or waiting is in vain."""
-        p, driver = self._p, self._driver
+        p, driver = self._p, self.driver
         if missing := p.missing_limits:
             driver.warn(f'{", ".join(missing)}: not set, so nothing keeps v within what the '
                         'actuator bears: set them')
@@ -251,7 +246,7 @@ class ControlLoop:
         core, commands = self.core, self.commands
         (_, lost, _, unsent), self._gap = self._gap, NEXT_SAMPLE
         if self.phase is Phase.BEGINS:
-            self._happens(Event.ANSWER)
+            self.phase = Event.ANSWER.after(self.phase)
             core.start_from(self.v)
             commands.output_ns = stamp_ns
             return core.step(y, y_m)
@@ -264,8 +259,8 @@ class ControlLoop:
         if reports and origin.changed_by(
             reports[-1] + origin.value, acted[-1] / core.command_of(1.0), self.estimate
         ):
-            self._driver.warn(f'{self._driver.applied} is {origin.value:.4g} beyond v: taken for '
-                              'another zero of the motor encoder, and subtracted')
+            self.driver.warn(f'{self.driver.applied} is {origin.value:.4g} beyond v: taken for '
+                             'another zero of the motor encoder, and subtracted')
             self.renew(origin.before)
             return self._step_core(y, y_m, stamp_ns)
         return core.step(y, y_m, lost, reports, others, acted)
@@ -275,32 +270,31 @@ class ControlLoop:
     @property
     def is_overdue(self) -> bool:
         """Whether the driver has been silent for too long, and that is new."""
-        silent_s = self._driver.steady_s() - self.heard.y_at
+        silent_s = self.driver.steady_s() - self.heard.y_at
         return self.phase in (Phase.BEGINS, Phase.RUNS) \
             and 0.0 < self._p.timeout.plant_output < silent_s
 
     def give_up(self) -> None:
         """The driver is silent: whenever it comes back, its state will be unknown."""
-        before = self.phase
-        self._happens(Event.TIMEOUT)
-        if self.phase is not before:
-            self._renew_core(self.estimate)
+        if self.phase in (Phase.BEGINS, Phase.RUNS):
+            self.phase = Event.TIMEOUT.after(self.phase)
+            self.renew(self.estimate)
             self.end(self._p.on_timeout)
 
     def stand_down(self) -> None:
-        self._happens(Event.RIVAL)
+        self.phase = Event.RIVAL.after(self.phase)
         self._ending = iter(())
 
     def hear_other(self, v: float) -> None:
         if self.standing_down and plausible(v):
             self._go_on_from(v)
-            self.commands.newest_ns = self._driver.now_ns()
+            self.commands.newest_ns = self.driver.now_ns()
 
     def resume(self) -> None:
         """Command again, from the newest v that was heard; the state of the plant is unknown."""
-        self._happens(Event.RIVAL_GONE)
+        self.phase = Event.RIVAL_GONE.after(self.phase)
         self.heard.y_at = nan
-        self._renew_core(self.estimate)
+        self.renew(self.estimate)
 
     def end(self, action: str) -> None:
         """Have send_next lead v to its end as on_stop or on_timeout say, if anybody knows v."""
@@ -316,8 +310,14 @@ class ControlLoop:
     def renew(self, estimate: Estimate | None) -> None:
         """Go on from the present v with a new core that begins with these estimates, if any."""
         if self.phase is Phase.RUNS:
-            self._happens(Event.INTERRUPTION)
-        self._renew_core(estimate)
+            self.phase = Event.INTERRUPTION.after(self.phase)
+        before = self.core
+        self.core = core = build_controller(self._p, estimate, self.executor)
+        core.go_on_from(before)
+        before.close()
+        core.compensating = before.compensating
+        core.estimator.adapting = before.estimator.adapting
+        self._gap, self._ending = NEXT_SAMPLE, iter(())
 
     def reset(self) -> None:
         self.renew(first_guess(self._p))
@@ -341,18 +341,6 @@ class ControlLoop:
             structure = build_structure(p)
             structure.go_on_from(core.structure)
             core.structure = structure
-
-    def _happens(self, event: Event) -> None:
-        self.phase = event.after(self.phase)
-
-    def _renew_core(self, estimate: Estimate | None) -> None:
-        before = self.core
-        self.core = core = build_controller(self._p, estimate, self.executor)
-        core.go_on_from(before)
-        before.close()
-        core.compensating = before.compensating
-        core.estimator.adapting = before.estimator.adapting
-        self._gap, self._ending = NEXT_SAMPLE, iter(())
 
     def _go_on_from(self, told: float) -> None:
         v = self.core.limits.go_on_from(told, self.v if self.knows_v else None)

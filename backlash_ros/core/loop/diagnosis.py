@@ -118,13 +118,8 @@ class TopicFigures(NamedTuple):
         return short(self.name)
 
     @property
-    def heard(self) -> list[Peer]:
-        return [peer for peer in self.peers if not peer.unfit]
-
-    def waiting(self, start: str) -> str:
-        why = f'{self.heard[0]} is there but sends none' if self.heard \
-            else f'nobody publishes it, {start}'
-        return f'waiting for {self}: {why}'
+    def heard(self) -> tuple[Peer, ...]:
+        return tuple(peer for peer in self.peers if not peer.unfit)
 
 
 class Neighbours(NamedTuple):
@@ -183,7 +178,8 @@ def figures_of_loop(
     statistics, estimate, law = loop.statistics, loop.estimate, loop.core.estimator
     # Hardware on topics falls silent where all joints are where they belong.
     may_be_silent = p.lockstep or p.io.style == 'joint_state_topic'
-    unreferred = not may_be_silent and 0.0 < p.timeout.reference < loop.unreferred_s
+    unreferred_s = loop.driver.steady_s() - loop.heard.y_m_at
+    unreferred = not may_be_silent and 0.0 < p.timeout.reference < unreferred_s
     return LoopFigures(
         **cast(Mapping[str, Any], gained), around=around,
         # In lockstep the outputs come as fast as the machine goes.
@@ -271,8 +267,11 @@ def causes_of(f: LoopFigures) -> tuple[Row, ...]:
     rate, age_s, period_s = timing.rate, timing.age_s, timing.nominal_s
     heard, due = f.heard, f.heard + f.lost
     begins = status is None and f.silent_s == 0.0
-    runs = status is not None and f.silent_s == 0.0
-    late_ms, clocks = f'{1e3 * abs(age_s):.3g} ms', 'set both clocks (chrony, PTP)'
+
+    def waiting(topic: TopicFigures, start: str) -> str:
+        return f'waiting for {topic}: ' + (f'{topic.heard[0]} is there but sends none'
+                                           if topic.heard else f'nobody publishes it, {start}')
+
     # In samples where the gap is known, else in time.
     stands_still = f.still >= 20 and f.v_swing > f.gap if isfinite(f.gap) \
         else f.still * period_s >= 5.0 and f.v_swing > 0.0
@@ -281,9 +280,8 @@ def causes_of(f: LoopFigures) -> tuple[Row, ...]:
         # What comes is of no use.
         ('bad outputs', warn if f.used else error, f.bad_outputs > TROUBLE * heard,
          f'{_percent(f.bad_outputs, heard)} of {y} is no finite number: check the sensor'),
-        ('bad references', warn, f.bad_references > 0,
-         f'{f.bad_references} {y_m} messages lately were no finite number: the last good one '
-         'holds'),
+        ('bad references', warn, f.bad_references > 0, f'{f.bad_references} {y_m} messages '
+         'lately were no finite number: the last good one holds'),
         ('wraps', warn, f.wraps > 0,
          f'{y} jumps by 2 pi: it is an angle that wraps: let the driver count the turns'),
         # Who else is there.
@@ -298,51 +296,42 @@ def causes_of(f: LoopFigures) -> tuple[Row, ...]:
         # What does not come.
         ('silent', warn, f.silent_s > 0.0,
          f'no {y} for {f.silent_s:g} s: is the driver running? on_timeout: {f.on_timeout}'),
-        ('waiting for output', warn, begins and heard == 0 and len(y.heard) == len(y.peers),
-         y.waiting('start the driver')),
-        ('waiting for reference', warn,
-         begins and f.reference_silent_s == inf and f.bad_references == 0
-         and len(y_m.heard) == len(y_m.peers),
-         y_m.waiting('start one')),
-        ('unheard', warn, runs and not v.peers,
+        ('waiting for output', warn, begins and heard == 0 and y.heard == y.peers,
+         waiting(y, 'start the driver')),
+        ('waiting for reference', warn, begins and f.reference_silent_s == inf
+         and f.bad_references == 0 and y_m.heard == y_m.peers, waiting(y_m, 'start one')),
+        ('unheard', warn, f.silent_s == 0.0 and not begins and not v.peers,
          f'nobody listens to {v}: is it the name that the driver uses?'),
         # When it comes.
-        ('rate', warn, isfinite(rate),
-         f'{y} comes at {rate:.4g} Hz, sample_period is {period_s:g} s '
-         f'({1.0 / period_s:.4g} Hz): '
+        ('rate', warn, isfinite(rate), f'{y} comes at {rate:.4g} Hz, sample_period is '
+         f'{period_s:g} s ({1.0 / period_s:.4g} Hz): '
          + ('is the driver held up?' if timing.is_stretched else 'correct one of them')),
         ('stamps', warn, timing.repeats_stamps,
          f'{y} repeats its stamps, so the time of sending counts: stamp each message anew'),
         ('clock', warn, abs(age_s) > SKEW * period_s,
-         f'{y} comes {late_ms} before its stamp: {clocks}' if age_s < 0.0
-         else f'{y} comes {late_ms} after its stamp: {clocks} or shorten the way'),
-        ('late', warn, f.late > TROUBLE * f.used,
-         f'{_percent(f.late, f.used)} of {v} came too late: relieve the machine or lengthen '
-         'sample_period'),
+         f'{y} comes {1e3 * abs(age_s):.3g} ms {"before" if age_s < 0.0 else "after"} its stamp: '
+         'set both clocks (chrony, PTP)' + (' or shorten the way' if age_s > 0.0 else '')),
+        ('late', warn, f.late > TROUBLE * f.used, f'{_percent(f.late, f.used)} of {v} came too '
+         'late: relieve the machine or lengthen sample_period'),
         ('unsent', warn, f.unsent > TROUBLE * due and not isfinite(rate),
-         f'{_percent(f.unsent, due)} of {y} was never sent or much too late: is the driver held '
-         'up?'),
+         f'{_percent(f.unsent, due)} of {y} was never sent or much too late: is it held up?'),
         ('lost', warn, f.lost - f.unsent > TROUBLE * due,
          f'{_percent(f.lost - f.unsent, due)} of {y} was lost on its way: check the network'),
-        ('reference silent', warn, 0.0 < f.reference_silent_s < inf,
-         f'no {y_m} for more than {f.reference_silent_s:g} s, the last one is held: publish it '
-         'every sample'),
+        ('reference silent', warn, 0.0 < f.reference_silent_s < inf, f'no {y_m} for more than '
+         f'{f.reference_silent_s:g} s, the last one is held: publish it every sample'),
         # What becomes of v.
         ('still', warn, stands_still,
          f'{y} stands still while v swings over {f.v_swing:.3g}'
          + (f' ({f.v_swing / f.gap:.3g} gaps)' if f.gap > 0.0 else '')
          + ': check sensor, actuator, its controller'),
-        ('limited', warn, f.limited > 0.5 * f.used
-         and status in (Status.INCONSISTENT, Status.NOT_EXCITED),
-         f'v is limited in {_percent(f.limited, f.used)} of the samples: widen control.min, max or '
-         'rate_max'),
-        ('unreported', warn, f.unreported > TROUBLE * f.used,
-         f'{_percent(f.unreported, f.used)} of the samples came without applied_control just '
-         'before them'),
-        ('worker', warn, f.dead_workers > 0,
-         'the process that makes the fits died '
-         + ('lately' if f.dead_workers == 1 else f'{f.dead_workers} times lately')
-         + '; v is not affected: check the memory'),
+        ('limited', warn, f.limited > 0.5 * f.used and status in (
+            Status.INCONSISTENT, Status.NOT_EXCITED), f'v is limited in '
+         f'{_percent(f.limited, f.used)} of the samples: widen control.min, max or rate_max'),
+        ('unreported', warn, f.unreported > TROUBLE * f.used, f'{_percent(f.unreported, f.used)} '
+         'of the samples came without applied_control just before them'),
+        ('worker', warn, f.dead_workers > 0, 'the process that makes the fits died '
+         + (f'{f.dead_workers} times ' if f.dead_workers > 1 else '')
+         + 'lately; v is not affected: check the memory'),
     )
 
 
@@ -358,10 +347,9 @@ def _states_beside(causes: set[str], f: LoopFigures) -> tuple[Row, ...]:
     many = f.late + f.lost > 0.1 * (f.heard + f.lost)
     late = not causes.isdisjoint(LATE_KINDS) and (many or inconsistent_s < 3.0)
     return (
-        ('held', warn, held and 'rate' in causes,
-         f'{y} does not follow from v at this rate: estimates held'),
-        ('held', warn, held and late,
-         f'{y} does not follow from v while samples are late or lost: estimates held'),
+        ('held', warn, held and ('rate' in causes or late), f'{y} does not follow from v '
+         + ('at this rate' if 'rate' in causes else 'while samples are late or lost')
+         + ': estimates held'),
         # What is not there yet is among the causes; else all is about to begin.
         ('begins', ok, status is None, 'the loop begins'),
         ('given', ok, given and status == Status.TRACKING,
@@ -375,8 +363,7 @@ def _states_beside(causes: set[str], f: LoopFigures) -> tuple[Row, ...]:
          + (', or correct the zero of y' if name != 'm' else '')),
         ('undecided', ok, law.undecided and status == Status.ACQUIRING,
          'learning: several gaps explain y alike: let v move between more than two values'),
-        ('acquiring', ok, status == Status.ACQUIRING,
-         'learning: the estimates still move freely'),
+        ('acquiring', ok, status == Status.ACQUIRING, 'learning: the estimates still move freely'),
         ('learned', ok, status == Status.TRACKING, 'learned: the estimates agree with the data'),
         ('not excited', warn, status == Status.NOT_EXCITED,
          'estimates held: v did not swing past the gap lately; move it wider'),
@@ -385,9 +372,8 @@ def _states_beside(causes: set[str], f: LoopFigures) -> tuple[Row, ...]:
          f'{y} moves against v: reverse it, or the sign of plant.numerator'),
         ('model', error, law.coasts,
          f'the load coasts in the gap ({share:.2g} % of m*gap): brake it, or move more slowly'),
-        ('model', error, _is_unexplained(law),
-         f'{share:.3g} % of m*gap of the motion of u fits no G and no backlash: check G(z), load, '
-         'sensor'),
+        ('model', error, _is_unexplained(law), f'{share:.3g} % of m*gap of the motion of u fits '
+         'no G and no backlash: check G(z), load, sensor'),
         ('model', error, True,
          f'{y} does not follow from v through G(z): check G(z), the sensor, the actuator'),
     )
