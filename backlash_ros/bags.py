@@ -63,12 +63,12 @@ class BagMessage(NamedTuple):
 class Bag:
     """An open bag. After a RecordingError it is closed, and holds what was flushed before.
 
-    path: folder, must not exist. storage: mcap or sqlite3. Raises ParameterError.
     saved: messages that a crash leaves. saved_ns: the time from the first to the last of them.
     survives_a_crash: whether flush() works with the version of rosbags that is installed.
     """
 
     def __init__(self, path: str, storage: str) -> None:
+        """path: folder, must not exist. storage: mcap or sqlite3. Raises ParameterError."""
         self.path = Path(path)
         self.saved = self.saved_ns = 0
         self.survives_a_crash = True
@@ -93,24 +93,21 @@ class Bag:
                                  'name a folder where there is room and you may write') from None
 
     def add_topic(self, topic: str, message_type: str) -> Connection:
-        """Announce a topic, with a type like std_msgs/msg/Float64; raises RecordingError."""
         with self._closed_on_error():
             return self._writer.add_connection(topic, message_type, typestore=self._types)
 
     def write(self, connection: Connection, stamp_ns: int, message: bytes) -> None:
-        """Write a serialised message; raises RecordingError."""
         with self._closed_on_error():
             self._writer.write(connection, stamp_ns, message)
 
     def flush(self) -> None:
-        """Let all that was written survive a crash and a power cut; raises RecordingError."""
+        """Let all that was written survive a crash and a power cut."""
         if self.survives_a_crash:
             with self._closed_on_error():
                 self._flush()
             self._note_saved()
 
     def close(self) -> None:
-        """Write what readers need to open the bag; raises RecordingError."""
         with self._closed_on_error():
             self._writer.close()
             _sync(*self.path.iterdir(), self.path)
@@ -150,25 +147,22 @@ class Bag:
 
 @contextmanager
 def _locked_folder(path: Path) -> Iterator[None]:
-    """Mark a bag as being written, at most until the process is gone.
-
-    Raises BlockingIOError if another process writes it. Some file systems cannot lock folders.
-    """
+    """Mark a bag as being written; raises BlockingIOError if another process writes it."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise
-        except OSError:
-            pass
+        except OSError as error:
+            # Some file systems cannot lock folders.
+            if isinstance(error, BlockingIOError):
+                raise
         yield
     finally:
         os.close(descriptor)
 
 
 def _sync(*paths: Path) -> None:
-    """Let files and the entries of folders survive a power cut; raises OSError."""
+    """Let files and the entries of folders survive a power cut."""
     for path in paths:
         descriptor = os.open(path, os.O_RDONLY)
         try:
@@ -197,8 +191,7 @@ def message_files(path: Path) -> list[Path]:
 class BagReader:
     """The messages of a bag: its folder, or a lone .mcap or .db3 file. Raises NoBagError.
 
-    topics: those of the bag, complete once messages() has ended. damage: what is wrong with the
-    bag, in words, '' for nothing, likewise.
+    topics, damage ('' for none): of the bag, complete once messages() has ended.
     """
 
     def __init__(self, path: Path) -> None:
@@ -305,8 +298,7 @@ def damage(bag: Path) -> str:
 def repair(bag: Path) -> list[str]:
     """Put a complete bag in the place of a damaged one, which is kept beside it.
 
-    Returns what was saved, in lines, nothing for a bag that is complete. Raises BagError,
-    NoBagError where there is none.
+    Returns what was saved, in lines, nothing for a complete bag; raises BagError.
     """
     bag = bag.resolve()
     if bag.is_file():

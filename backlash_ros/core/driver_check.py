@@ -47,19 +47,14 @@ class Message(NamedTuple):
 
 @dataclass
 class Graph:
-    """What the ROS graph says about the topics of the driver.
-
-    publishers, types, best_effort: of plant_output. listeners: of control, without the tools of
-    this package. misfits: reasons why messages cannot pass, from QoS. near_control: subscribed
-    topics of a name like control.
-    """
+    """What the ROS graph says of plant_output, and of control without the tools of this package."""
 
     publishers: int = 0
     types: tuple[str, ...] = ()
     listeners: int = 0
-    misfits: tuple[str, ...] = ()
-    best_effort: bool = False
-    near_control: tuple[str, ...] = ()
+    misfits: tuple[str, ...] = ()  # reasons why control cannot pass, from QoS
+    best_effort: bool = False  # plant_output
+    near_control: tuple[str, ...] = ()  # subscribed topics of a name like control
 
 
 @dataclass
@@ -81,10 +76,9 @@ class Heard:
 class Sampling(NamedTuple):
     """Samples without repetitions, a row each, their count from 0 and their period.
 
-    commanded, reported: v over each sample interval (N,), nan before any; None where nothing tells
-    it. repeated: with the value of the one before. early: with another value, but long before they
-    were due. lateness: of a period, exceeded by 1 % of the samples. bursts: they are so late that
-    they cannot be counted for certain.
+    repeated: with the value of the one before. early: with another value, but long before they were
+    due. lateness: of a period, of 98 % of the samples. bursts: they cannot be counted for certain.
+    commanded, reported: v over each interval (N,), nan before any; None where nothing tells it.
     """
 
     outputs: NDArray[np.void]
@@ -161,8 +155,7 @@ class Judgement(NamedTuple):
 
 
 class Row(NamedTuple):
-    """What is said of a subject if it is wrong, or else `well`, if that is all; `hides` what then
-    cannot be judged."""
+    """What is said of a subject if it is wrong, which `hides` others; or else `well`, if any."""
 
     subject: str
     wrong: object
@@ -198,11 +191,12 @@ def _hidden(subject: str, behind: str) -> Judgement:
 
 
 def _of_graph(graph: Graph, p: Parameters) -> Iterator[Row]:
+    all_else = (*MESSAGES, *MOTION)
     yield Row('publisher', graph.publishers > 1, f'{graph.publishers} publishers on plant_output',
-              'stop all but one (`ros2 topic info -v plant_output` names them)',
-              (*MESSAGES, *MOTION), 'one publisher on plant_output')
+              'stop all but one (`ros2 topic info -v plant_output` names them)', all_else,
+              'one publisher on plant_output')
     yield Row('type', graph.types != (FLOAT64,), f'plant_output is {", ".join(graph.types)}',
-              f'publish y as {FLOAT64}', (*MESSAGES, *MOTION))
+              f'publish y as {FLOAT64}', all_else)
     deaf = graph.best_effort and not p.io.best_effort
     misfits = (*graph.misfits, *['plant_output is best effort, control reliable'] * deaf)
     yield Row('QoS', misfits, '; '.join(misfits), 'use reliable, volatile, keep last (the default '

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from rclpy.node import Node
 from rclpy.qos import QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
@@ -48,7 +48,7 @@ class DriverGraph:
     def in_the_end(self) -> Graph:
         """All that was noted, with topics that may have been meant for v."""
         listened_to = self._topics(self._node.get_subscriptions_info_by_topic)
-        self._graph.near_control = tuple(similar_topics(self._names[topics.CONTROL], listened_to))
+        self._graph.near_control = similar_topics(self._names[topics.CONTROL], listened_to)
         return self._graph
 
     def say_what_is_missing(self) -> None:
@@ -87,12 +87,8 @@ def _misfit(asked: QoSProfile) -> str:
     return f'control: {reason}' if compatibility == QoSCompatibility.ERROR else ''
 
 
-def similar_topics(wanted: str, seen: Mapping[str, Sequence[str]]) -> list[str]:
-    """Topics (with their types) that may be the wanted one under another name, likeliest first."""
-    def likeness(topic: str) -> float:
-        last, other = (name.rsplit('/', 1)[-1] for name in (wanted, topic))
-        return difflib.SequenceMatcher(None, last, other).ratio() - 1e-9 * len(topic) + 0.1 * (
-            FLOAT64 in seen[topic])
-
-    return sorted((topic for topic in seen if topic != wanted and likeness(topic) >= 0.6),
-                  key=likeness, reverse=True)
+def similar_topics(wanted: str, seen: Iterable[str]) -> tuple[str, ...]:
+    """Topics that may be the wanted one under another name, by the last part of it."""
+    last = wanted.rpartition('/')[2]
+    return tuple(topic for topic in sorted(seen) if topic != wanted and
+                 difflib.SequenceMatcher(None, last, topic.rpartition('/')[2]).ratio() >= 0.6)

@@ -1,8 +1,5 @@
-"""Which values of y are readings of their own, and of the quantity that is meant.
-
-Repetitions of a slower sensor, the fixed number of a read that failed and angles that begin anew
-are recognised only where nothing else explains them.
-"""
+"""Which values of y are readings: no repetitions, failed reads or lost turns, which are recognised
+only where nothing else explains them."""
 
 from __future__ import annotations
 
@@ -30,10 +27,10 @@ def quantum(y: Array) -> float:
 
 def own_readings(t: Array, y: Array) -> tuple[Flags, float]:
     """Rows (N,) in which y is a reading of its own, and the period [s] of a sensor slower than the
-    rows; 0, and every known y, where each row may be a reading.
+    rows, else 0. t (N,): instants [s], rising.
 
-    t (N,): instants [s], rising. A y that moves by several quanta a reading changes in every row,
-    unless rows repeat it. At rest a reading looks like its repetition: one a period is taken.
+    A y that moves by several quanta a reading changes in every row, unless rows repeat it. At rest
+    a reading looks like its repetition: one a period is taken.
     """
     fewest_changes = 12  # of y, beyond all rounding, that tell a slower sensor
     known = np.flatnonzero(np.isfinite(y))
@@ -64,11 +61,8 @@ def own_readings(t: Array, y: Array) -> tuple[Flags, float]:
 
 
 def failed(y: Array) -> tuple[Flags, float]:
-    """Rows (N,) that hold one exact value far from both neighbours, and that value.
-
-    What drivers write where a read failed, once or twice in a row: 0, or the largest or smallest
-    number of all.
-    """
+    """Rows (N,) of reads that failed, where drivers write 0, or the largest or smallest number of
+    all, once or twice in a row, far from both neighbours; and that value."""
     known = np.flatnonzero(np.isfinite(y))
     values = y[known]
     rows = np.zeros(len(y), dtype=bool)
@@ -92,8 +86,7 @@ def failed(y: Array) -> tuple[Flags, float]:
 def unwrapped(values: Array) -> tuple[Array, float]:
     """The values (N,) without the jumps of an angle that begins anew, and the turn; 0 for none.
 
-    A turn is certain where the values fill it and no more, and every large jump is a whole turn to
-    a few usual steps, with the motion around it the other way.
+    The values fill it and no more; all large jumps are whole turns, against the motion around them.
     """
     turn_tolerance = 0.02  # relative, of the jump of an angle that begins anew
     # Degrees, radians, gradians, steps of encoders.
@@ -117,7 +110,6 @@ def unwrapped(values: Array) -> tuple[Array, float]:
 
 
 def _without(turn: float, jumps: Flags, values: Array) -> Array:
-    """The values (N,) less a turn after each jump from a known one to the next."""
     known, out = np.isfinite(values), values.copy()
     turns = np.where(jumps, turn * np.sign(np.diff(values[known])), 0.0)
     out[known] -= np.append(0.0, np.cumsum(turns))
@@ -125,10 +117,7 @@ def _without(turn: float, jumps: Flags, values: Array) -> Array:
 
 
 def without_slips(y: Array, v: Array) -> tuple[Array, float]:
-    """y (N,) without rare jumps by a whole turn that v (N,) does not make, and the turn; 0: none.
-
-    Drivers that count turns lose one, or gain it, when they are restarted or read late.
-    """
+    """y (N,) without rare jumps by a turn that v (N,) does not make, and that turn; 0 for none."""
     known = np.flatnonzero(np.isfinite(y))
     steps = np.diff(y[known])
     if len(steps) < 20:  # too few to judge a jump by

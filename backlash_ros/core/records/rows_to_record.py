@@ -1,10 +1,8 @@
 """From rows of a log with stamps of any kind to v and y on one uniform grid.
 
-Two kinds of uneven stamps are told apart by the motion itself, which is smooth over the true
-instants: either the samples were taken evenly and their stamps are late, then rows are numbered; or
-they were taken at those instants. Then v, which holds from row to row, is averaged over each period
-of the grid, and y is moved onto it only where the error of that is hidden by its noise; else the
-grid is finer, with nothing between the readings.
+The motion, smooth over the true instants, tells stamps that are late, where rows are numbered, from
+true ones. Over these v, which holds, is averaged over each period, and y is moved onto the grid
+where its noise hides the error of that; else the grid is finer, with nothing between the readings.
 """
 
 from __future__ import annotations
@@ -29,11 +27,8 @@ MOST_SAMPLES = 1_000_000  # of a grid
 
 
 class Rows(NamedTuple):
-    """Rows in order. t (M,) [s]. y (M,): nan where it is no reading of its own.
-
-    v, commands: (M,), or times and values of their own (2, K), as in a log of events. reported:
-    whether those of v tell what acted until then.
-    """
+    """In order: t (M,) [s], y (M,), nan where it is no reading of its own; v and commands, (M,), or
+    times and values of their own (2, K); whether those of v report what acted until then."""
 
     t: Array
     v: Array
@@ -43,7 +38,7 @@ class Rows(NamedTuple):
 
 
 class Numbering(NamedTuple):
-    """Of rows (M,), whose stamps lie around begin + period * numbers [s], off (M,) that."""
+    """Of rows (M,), whose stamps lie `off` begin + period * numbers [s]."""
 
     numbers: Numbers
     period: float
@@ -55,10 +50,9 @@ def record_of(
     t: Array | None, v: Array, y: Array, period: float | None = None,
     unit_s: float | None = None, commands: Array | None = None,
 ) -> Record:
-    """A record from rows (N,) of a log; nan for what is not known.
+    """A record from rows (N,) of a log, nan for what is not known; raises RecordError.
 
-    t: stamps, None where there are none. period [s]: from sample to sample, None tells it from the
-    stamps. unit_s: of the stamps [s], None where the log does not say it. Raises RecordError.
+    t: stamps, of unit_s [s] if the log says it. period [s]: from sample to sample, if known.
     """
     said, notes = list[str](), list[str]()
     if len(v) < 2:
@@ -90,7 +84,6 @@ def record_of(
     begin = table[0, 0]
     t = stamps.spread_evenly(table[0] - begin, said, *table[1:3])
     v, y = without_turns(t, _held(table[1]), table[2], said, notes)
-    _check(y=y)
     if sent is not None:
         v = sent - np.array([[begin], [0.0]])
     record = on_grid(Rows(t, v, y, None if commands is None else _held(table[3])), period)
@@ -100,10 +93,7 @@ def record_of(
 def without_turns(
     t: Array, v: Array, y: Array, said: list[str], notes: list[str],
 ) -> tuple[Array, Array]:
-    """v (N,) and y (N,) at t (N,) without whole turns; y nan where it is no reading of its own.
-
-    What was done is added to said and notes.
-    """
+    """v (N,) and y (N,) at t (N,) without whole turns; y nan where it is no reading of its own."""
     # An angle that begins anew is far from the rows around as well.
     bad, value = readings.failed(readings.unwrapped(y)[0])
     if bad.any():
@@ -123,9 +113,9 @@ def without_turns(
 
 
 def usable(record: Record, read: Array, said: list[str], notes: list[str]) -> Record:
-    """From the first known v on; a v that is not known is the one before it.
+    """From the first known v on, held where it is not known. read: y, before it was moved.
 
-    read: readings of y, whose step counts. Raises RecordError where v or y are no measurements.
+    Raises RecordError where v or y are no measurements.
     """
     _check(v=record.v, y=record.y)
     first = int(np.argmax(np.isfinite(record.v)))
@@ -163,10 +153,9 @@ def _held(values: Array) -> Array:
 
 
 def on_grid(rows: Rows, period: float | None = None, late: bool = False) -> Record:
-    """Rows on a grid. period [s]: of the samples, None tells it from the stamps.
+    """Rows on a grid of this period [s], if it is known; raises RecordError.
 
-    late: stamps are those of messages, which are late, never early. Raises RecordError where there
-    are too few, or they are spread over too long a time.
+    late: stamps are those of messages, which are late, never early.
     """
     nearly_even = 0.02  # of a period that stamps of even samples may be off
     guess = period or (stamps.typical_step(rows.t) if late else _period(rows.t))
@@ -215,7 +204,7 @@ def _period(t: Array) -> float:
 
 
 def _longest_stretch(rows: Rows, period: float) -> tuple[Rows, str]:
-    """Without what lies far before and after, where the time between holds no rows; said so."""
+    """Without what lies far before and after; what was done."""
     long_break = 100.0  # periods of a gap that ends a stretch
     t, span = rows.t, np.ptp(rows.t) / period
     if span < min(20.0 * len(t) + long_break, MOST_SAMPLES):
@@ -235,13 +224,12 @@ def _longest_stretch(rows: Rows, period: float) -> tuple[Rows, str]:
 
 
 def _along(numbers: Numbers, t: Array) -> Numbering:
-    """With the line that fits t (M,) [s] best."""
     period, begin = np.polyfit(numbers, t, 1).tolist()
     return Numbering(numbers, period, begin, t - begin - period * numbers)
 
 
 def _numbering(t: Array, steps: Array, period: float, late: bool) -> Numbering:
-    """The numbers of rows t (M,) that lie closest to a line. steps (M - 1,): in periods."""
+    """The one that lies closest to a line. steps (M - 1,): in periods."""
     found = [_along(_numbered(t / period), t)]
     if not late:
         # The median of uneven steps is off by more than a long record bears.
@@ -262,11 +250,8 @@ def _numbering(t: Array, steps: Array, period: float, late: bool) -> Numbering:
 
 
 def _numbered(times: Array) -> Numbers:
-    """Number of each sample from its time [sample periods], rising from 0.
-
-    Samples are late, never early: what comes before the next one is due is still the sample before,
-    and of those that come in a heap the last one is the newest.
-    """
+    """From times [periods], late, never early: what comes before the next one is due is still the
+    sample before, and of those that come in a heap the last one is the newest."""
     begin, number = float(times[0]), 0
     passed = np.zeros(len(times))
     for i, time in enumerate(times.tolist()):

@@ -38,10 +38,8 @@ def busiest(v: Array, y: Array) -> slice:
 
 
 def outliers(residual: Array, least_std: float) -> NDArray[np.bool_]:
-    """Readings that are none, by the bulk of a residual (N,), nan where y is not known.
-
-    least_std: deviation of y that is believed at least. None at all where they are many.
-    """
+    """Flags (N,) of what is beyond the bulk of a residual (N,), nan where y is lost; none where
+    they are many. least_std: deviation of y that is believed at least."""
     size = np.abs(residual)
     known = size[np.isfinite(size)]
     typical = TO_STD * float(np.median(known)) if len(known) else 0.0
@@ -53,8 +51,7 @@ def frequencies_of(y: Array) -> tuple[float, float]:
     """Lowest and highest frequency between which y (N,) moves [rad/sample]; nan where lost."""
     motion = (0.1, 0.9)  # shares of the power of the moves of y below which its frequencies lie
     known = np.flatnonzero(np.isfinite(y))
-    filled = np.interp(np.arange(len(y)), known, y[known])
-    moves = np.diff(filled)
+    moves = np.diff(np.interp(np.arange(len(y)), known, y[known]))
     power = np.abs(np.fft.rfft((moves - moves.mean()) * np.hanning(len(moves)))) ** 2
     total = np.cumsum(power)
     low, high = np.searchsorted(total, np.array(motion) * total[-1]) * (2.0 * np.pi / len(moves))
@@ -96,10 +93,7 @@ def curvature_of(t: Array, y: Array, noise: float) -> float:
 
 
 def rougher(t: Array, other: Array, signal: Array) -> float:
-    """Log of how much rougher a signal (N,) is over the instants t than over the other ones (N,).
-
-    0 where too few values tell.
-    """
+    """Log of how much rougher a signal (N,) is over the instants t (N,) than over other (N,)."""
     known, sizes = np.isfinite(signal), []
     for instants in (t, other):
         squares = _residuals(instants[known], signal[known], 1)**2

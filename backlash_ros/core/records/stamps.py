@@ -1,7 +1,4 @@
-"""Stamps of a log in seconds, and its rows in the order of time, without stamps that are none.
-
-What was done is added to `said`, a sentence each.
-"""
+"""Stamps of a log in seconds, and its rows in the order of time, without stamps that are none."""
 
 from __future__ import annotations
 
@@ -18,7 +15,7 @@ def in_seconds(
 ) -> Array:
     """Stamps [s] of `count` rows, by their number where there are none, or none that move.
 
-    unit_s: None where the log does not say it. Raises RecordError where the period is needed.
+    unit_s: if the log says it. said: takes up what was done. Raises RecordError.
     """
     known = np.empty(0) if t is None else t[np.isfinite(t)]
     if t is None or np.unique(known).size < 2:
@@ -75,10 +72,8 @@ def typical_step(t: Array) -> float:
 
 
 def in_order(t: Array, said: list[str], what: str = 'row') -> NDArray[np.intp]:
-    """Rows of the stamps t (N,) [s] that are kept, by time. what: name of a row.
-
-    Raises RecordError where the stamps make no sense.
-    """
+    """Rows of the stamps t (N,) [s] that are kept, by time; raises RecordError where they make no
+    sense. what: name of a row."""
     def count(number: int, of: str = what) -> str:
         return f'{number} {of}{"" if number == 1 else "s"}'
 
@@ -122,11 +117,8 @@ def in_order(t: Array, said: list[str], what: str = 'row') -> NDArray[np.intp]:
 
 
 def spread_evenly(t: Array, said: list[str], *signals: Array) -> Array:
-    """Stamps (N,) of rows of which several in a row have the same one, of a clock that is coarse.
-
-    Where a signal (N,) moves within such a run as it does from run to run, rows were taken evenly;
-    else the same readings were written again, and the stamps stay.
-    """
+    """Stamps (N,) of a coarse clock, where several rows in a row have the same one and the signals
+    (N,) move within such a run as from run to run; else the same readings were written again."""
     begins = np.flatnonzero(np.diff(t, prepend=-np.inf) > 0.0)
     lengths, starts = np.diff(begins, append=len(t)), t[begins]
     if len(lengths) < 4 or np.median(lengths[:-1]) < 2.0:
