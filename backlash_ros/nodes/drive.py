@@ -24,7 +24,7 @@ from backlash_ros.core.control.limits import plausible
 from backlash_ros.core.driver_check import Heard, Message
 from backlash_ros.core.identification.motion import Drive, Shape, drive_limits, strokes
 from backlash_ros.core.parameters.table import CONTROLLER
-from backlash_ros.nodes.control.rivals import Presence, identity_made_by, names_of
+from backlash_ros.nodes.control.rivals import Presence, identity_made_by, name_of
 from backlash_ros.nodes.driver_graph import DriverGraph
 from backlash_ros.nodes.runtime.executor import PromptExecutor
 from backlash_ros.nodes.runtime.messages import DEPTH
@@ -64,7 +64,8 @@ class MotionNode(ProcessNode):
         """Called every LOOK_S while the node listens."""
         if self.options.drive:
             # Once heard, a rival counts, even if it leaves.
-            self._rivals = self._rivals or names_of(self.graph.publishers(topics.CONTROL))
+            rivals = {name_of(info) for info in self.graph.publishers(topics.CONTROL)}
+            self._rivals = self._rivals or ', '.join(sorted(rivals))
         self.graph.look()
 
     def say(self, text: str) -> None:

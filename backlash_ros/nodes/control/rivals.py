@@ -5,11 +5,11 @@ from __future__ import annotations
 import hashlib
 import socket
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from math import inf
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
@@ -19,7 +19,8 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from backlash_ros import topics
 from backlash_ros.core.loop.diagnosis import UNNAMED
-from backlash_ros.nodes.runtime.messages import SILENT_S
+from backlash_ros.nodes.runtime.executor import serve_polled
+from backlash_ros.nodes.runtime.messages import SILENT_S, arrival_ns
 from backlash_ros.nodes.runtime.process import ProcessNode
 
 # Keys in /diagnostics by which controllers know each other.
@@ -119,7 +120,9 @@ class RivalWatch:
         self.presence = Presence(node.context.get_domain_id(), self.topic, own)
         self._others: frozenset[str] = frozenset()
         self._hello_until = -inf  # until then others are told at every look who was first
-        self._diagnostics: Subscription | None = None  # listened to only beside others
+        self._diagnostics = node.listen(
+            DiagnosticArray, topics.DIAGNOSTICS, self._hear, 100, polled=True
+        )
         self.commands: Subscription | None = None  # of who is in charge, if it is another one
         node.every(0.2, self.look)
 
@@ -150,23 +153,18 @@ class RivalWatch:
             self._rivals.settled_at = max(self._rivals.settled_at, now)
         if self._others != others.keys():
             self._others, self._hello_until = frozenset(others), now + 2.0
-        if others and self._diagnostics is None:
-            self._diagnostics = node.create_subscription(
-                DiagnosticArray, topics.DIAGNOSTICS, self._hear, 10
-            )
-        elif not others and self._diagnostics is not None:
-            node.destroy_subscription(self._diagnostics)
-            self._diagnostics = None
+        if others:
+            serve_polled(self._diagnostics)
         self.found = self._rivals.among(others, now)
         if before and not self.found:
             node.log.info(f'nobody else publishes {self.topic} any more')
         if self.found != before or (others and now < self._hello_until):
             self._changed()
 
-    def _hear(self, message: DiagnosticArray) -> None:
+    def _hear(self, message: DiagnosticArray, info: dict[str, Any]) -> None:
         for status in message.status:
             values = {each.key: each.value for each in status.values}
-            self._rivals.hear(values, time.monotonic())
+            self._rivals.hear(values, 1e-9 * arrival_ns(info['received_timestamp']))
 
 
 def name_of(info: TopicEndpointInfo) -> str:
@@ -176,30 +174,20 @@ def name_of(info: TopicEndpointInfo) -> str:
     return f'{info.node_namespace.rstrip("/")}/{info.node_name}'
 
 
-def names_of(infos: Iterable[TopicEndpointInfo]) -> str:
-    """The nodes that endpoints belong to, each once."""
-    return ', '.join(sorted({name_of(info) for info in infos}))
-
-
 def identity_of(info: TopicEndpointInfo) -> str:
     """Identity of an endpoint, one and the same for all who see it."""
     return bytes(info.endpoint_gid).hex()
 
 
-def identity_made_by(
-    node: Node, topic: str, advertise: Callable[[], Publisher], within_s: float = 10.0,
-) -> str:
+def identity_made_by(node: Node, topic: str, advertise: Callable[[], Publisher]) -> str:
     """Identity of the publisher that advertise makes; rclpy has no way to ask for it."""
     own_name = node.get_fully_qualified_name()
     before = {identity_of(info) for info in node.get_publishers_info_by_topic(topic)}
     advertise()
-    deadline = time.monotonic() + within_s
-    while time.monotonic() < deadline:
+    for _ in range(10_000):
         # A namesake that is discovered at this very moment has no name yet.
         for info in node.get_publishers_info_by_topic(topic):
             if identity_of(info) not in before and name_of(info) == own_name:
                 return identity_of(info)
         time.sleep(1e-3)
-    raise RuntimeError(
-        f'the graph does not show the own publisher of {topic} within {within_s:g} s'
-    )
+    raise RuntimeError(f'the graph does not show the own publisher of {topic}')
