@@ -10,12 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from rclpy.utilities import remove_ros_args
 
 from backlash_ros.core.driver_check import WRONG, Judgement, all_fit, judge, table, timing_of
 from backlash_ros.core.identification.motion import waves
 from backlash_ros.nodes.drive import MotionNode
-from backlash_ros.nodes.runtime.process import ros_arguments, run
+from backlash_ros.nodes.runtime.process import run, split_arguments
 from backlash_ros.options import DONE, FAILED, OptionParser, add_motion_options, find_config
 
 
@@ -82,10 +81,9 @@ def _parameter_files(config: str, folder: Path) -> list[str]:
 
 def main(args: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    arguments = sys.argv[1:] if args is None else args
-    options = parse_options(remove_ros_args(['', *arguments])[1:])
+    plain, given = split_arguments(args)
+    options = parse_options(plain)
     with tempfile.TemporaryDirectory() as folder:
-        given = ros_arguments(arguments)
         if options.config is not None:
             config = str(find_config(Path(options.config)))
             for file in reversed(_parameter_files(config, Path(folder))):

@@ -15,7 +15,6 @@ from typing import Any
 
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
-from rclpy.utilities import remove_ros_args
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
@@ -28,7 +27,7 @@ from backlash_ros.nodes.control.rivals import Presence, identity_made_by, name_o
 from backlash_ros.nodes.driver_graph import DriverGraph
 from backlash_ros.nodes.runtime.executor import PromptExecutor
 from backlash_ros.nodes.runtime.messages import DEPTH
-from backlash_ros.nodes.runtime.process import ProcessNode, ros_arguments, run
+from backlash_ros.nodes.runtime.process import ProcessNode, run, split_arguments
 from backlash_ros.options import BAD_INPUT, DONE, FAILED, add_motion_options
 
 LOOK_S = 0.1  # between two looks at the graph
@@ -223,15 +222,15 @@ class IdentificationDriveNode(MotionNode):
 
 def main(args: list[str] | None = None) -> int:
     """Entry point; returns the exit code. The options are those that `identify` has checked."""
-    arguments = sys.argv[1:] if args is None else args
+    plain, of_ros = split_arguments(args)
     parser = argparse.ArgumentParser(prog='identify')
     parser.set_defaults(drive=True)
     parser.add_argument('--messages', type=Path, required=True)
     parser.add_argument('--config', required=True)
     add_motion_options(parser, 10.0, 'how long to listen')
-    options = parser.parse_args(remove_ros_args(['', *arguments])[1:])
+    options = parser.parse_args(plain)
     return run('identify', lambda: IdentificationDriveNode(options),
-               ['--ros-args', '--params-file', options.config, *ros_arguments(arguments)])
+               ['--ros-args', '--params-file', options.config, *of_ros])
 
 
 if __name__ == '__main__':

@@ -18,11 +18,9 @@ from pathlib import Path
 from threading import Lock, Thread
 from typing import Any
 
-from rclpy.utilities import remove_ros_args
-
 from backlash_ros.nodes import followed
 from backlash_ros.nodes.runtime.executor import PromptExecutor
-from backlash_ros.nodes.runtime.process import ENABLED, ProcessNode, emit, ros_arguments, run
+from backlash_ros.nodes.runtime.process import ENABLED, ProcessNode, emit, run, split_arguments
 from backlash_ros.options import port
 from backlash_ros.topics import WATCH_LABELS
 
@@ -154,14 +152,14 @@ def content_of(state: followed.ControllerState, now_s: float) -> dict[str, objec
 
 
 def main(args: list[str] | None = None) -> int:
-    arguments = sys.argv[1:] if args is None else args
+    plain, of_ros = split_arguments(args)
     parser = followed.viewer_options(
         'live', __doc__,
         'From elsewhere: ssh -L PORT:127.0.0.1:PORT HOST, then open the same address there.',
     )
     parser.add_argument('--port', type=port, default=0, metavar='PORT',
                         help='of the page (default: a free one)')
-    options = parser.parse_args(remove_ros_args(['', *arguments])[1:])
+    options = parser.parse_args(plain)
     shown_s = 10.0
     try:
         server = PageServer(options.port, kept=round(shown_s / PAGE_PERIOD_S))
@@ -169,8 +167,7 @@ def main(args: list[str] | None = None) -> int:
         parser.error(f'--port={options.port}: {error.strerror}: choose another one, or none')
     followed.give_way()
     with server:
-        return run('live', lambda: LiveNode(options.name, server, shown_s),
-                   ros_arguments(arguments))
+        return run('live', lambda: LiveNode(options.name, server, shown_s), of_ros)
 
 
 if __name__ == '__main__':

@@ -20,7 +20,6 @@ from math import floor, isfinite, isnan, log10
 from textwrap import wrap
 from typing import Any
 
-from rclpy.utilities import remove_ros_args
 from rich.console import Console, Group
 from rich.live import Live
 from rich.panel import Panel
@@ -30,7 +29,7 @@ from std_srvs.srv import SetBool, Trigger
 from backlash_ros.nodes import followed
 from backlash_ros.nodes.followed import ControllerState
 from backlash_ros.nodes.runtime.executor import PromptExecutor
-from backlash_ros.nodes.runtime.process import ProcessNode, ros_arguments, run
+from backlash_ros.nodes.runtime.process import ProcessNode, run, split_arguments
 from backlash_ros.topics import BACKLASH
 
 SCREEN_PERIOD_S = 0.2
@@ -254,13 +253,13 @@ def pressed_keys() -> Iterator[Callable[[], str]]:
 
 
 def main(args: list[str] | None = None) -> int:
-    arguments = sys.argv[1:] if args is None else args
+    plain, of_ros = split_arguments(args)
     options = followed.viewer_options(
         'monitor', __doc__, 'keys: f freezes or goes on learning, c compensates or not, r (twice) '
         'resets the estimates,\n      s saves them, Tab takes the next controller, q ends.',
-    ).parse_args(remove_ros_args(['', *arguments])[1:])
+    ).parse_args(plain)
     followed.give_way()
-    return run('monitor', lambda: MonitorNode(options.name), ros_arguments(arguments))
+    return run('monitor', lambda: MonitorNode(options.name), of_ros)
 
 
 if __name__ == '__main__':

@@ -48,14 +48,14 @@ def emit(event: str, **content: object) -> None:
         }), flush=True)
 
 
-def ros_arguments(arguments: Sequence[str]) -> list[str]:
-    """The part between --ros-args and --, all of them."""
-    found, inside = [], False
+def split_arguments(args: list[str] | None) -> tuple[list[str], list[str]]:
+    """What ROS has nothing to do with, and all between --ros-args and --."""
+    arguments, of_ros, inside = sys.argv[1:] if args is None else args, [], False
     for argument in arguments:
         inside = (inside or argument == '--ros-args') and argument != '--'
         if inside:
-            found.append(argument)
-    return found
+            of_ros.append(argument)
+    return remove_ros_args(['', *arguments])[1:], of_ros
 
 
 class ProcessNode(ParameterNode):
