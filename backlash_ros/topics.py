@@ -25,9 +25,7 @@ BACKLASH = ('m', 'c_r', 'c_l')
 # always nan: f is given, or adapted by a law that knows no deviations.
 ESTIMATE_LABELS = ('m', 'c_r', 'c_l', 'f', 'std_m', 'std_c_r', 'std_c_l', 'std_f', 'sample')
 # latency_s is the time from the departure of y(k) at the driver to that of v(k) at the controller.
-SIGNAL_LABELS = (
-    'y_m', 'y', 'u_d', 'v', 'u_hat', 'innovation', 'status', 'sample', 'latency_s',
-)
+SIGNAL_LABELS = ('y_m', 'y', 'u_d', 'v', 'u_hat', 'innovation', 'status', 'sample', 'latency_s')
 # A topic each below WATCH, for plots: an estimate with its band of two standard deviations.
 WATCH_LABELS = (
     'm', 'm_low', 'm_high', 'c_r', 'c_r_low', 'c_r_high', 'c_l', 'c_l_low', 'c_l_high', 'gap',

@@ -3,21 +3,15 @@
 import os
 import signal
 import sys
-from types import FrameType
 
 from backlash_ros.middleware import ROS_MISSING, ros_is_missing
-
-
-def _end(number: int, frame: FrameType | None) -> None:
-    os._exit(0)
-
 
 # With -m, sys.argv[0] is '-m' until the module is found; else it is the installed script.
 if sys.argv and os.path.basename(sys.argv[0]) in (
     '-m', 'controller', 'plant', 'reference', 'recorder', 'check_driver', 'monitor', 'live',
 ):
     for _number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(_number, _end)
+        signal.signal(_number, lambda number, frame: os._exit(0))
     # Whoever starts a node may hold them back until here, where they end it well.
     signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT, signal.SIGTERM))
     if ros_is_missing():

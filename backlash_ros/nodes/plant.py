@@ -37,7 +37,6 @@ class PlantNode(ProcessNode):
         self._plant = build_plant(p)
         # The same draws as in a simulation in one process, so that runs agree to the last bit.
         self._loss_rng = np.random.default_rng([p.seed, 1])
-        self._started = False
         self._held = HeldControl()  # times of arrival on the monotonic clock
         self._heard = self._expecting = False  # a first v; none since the newest output
         self._counts: Counter[str] = Counter()
@@ -62,7 +61,9 @@ class PlantNode(ProcessNode):
             f'sample_period {p.sample_period:g} s ({1.0 / p.sample_period:.4g} Hz)'
             + (f'; waits for {wanted} subscribers of {outputs}' if wanted else '')
         )
-        self.call_when(self._is_heard, self._start, f'subscribers of {outputs}')
+        self.start_when(
+            self._is_heard, self._offer if p.lockstep else lambda: None, f'subscribers of {outputs}'
+        )
 
     def _is_heard(self) -> bool:
         """Whether enough listen; one of several is a recorder, which wants everything."""
@@ -80,7 +81,7 @@ class PlantNode(ProcessNode):
         self._plant.change(self.settings)
 
     def work(self, executor: PromptExecutor) -> None:
-        while not (self._started or self.stopping):
+        while not (self.started or self.stopping):
             executor.spin_once()
         if not self.settings.lockstep:
             self._keep_time(executor)
@@ -89,12 +90,6 @@ class PlantNode(ProcessNode):
     def finish(self) -> None:
         counts = ', '.join(f'{count} {what}' for what, count in self._counts.items() if count)
         self.log.info(f'{self._plant.sample} samples' + (f', {counts}' if counts else ''))
-
-    def _start(self) -> None:
-        self._started = True
-        emit('ready')
-        if self.settings.lockstep:
-            self._offer()
 
     def _on_control(self, message: Float64, info: dict[str, Any]) -> None:
         v = message.data

@@ -20,7 +20,7 @@ from backlash_ros.core.scenario import build_reference
 from backlash_ros.nodes.runtime import messages
 from backlash_ros.nodes.runtime.driver_io import DriverIo
 from backlash_ros.nodes.runtime.executor import PromptExecutor, serve_polled
-from backlash_ros.nodes.runtime.process import ProcessNode, emit, run
+from backlash_ros.nodes.runtime.process import ProcessNode, run
 
 
 class ReferenceNode(ProcessNode):
@@ -36,7 +36,6 @@ class ReferenceNode(ProcessNode):
         self._signal = build_reference(p)
         self._offset_s = 0.0  # keeps the phase where the frequency changes
         self._newest = 0  # sample that was published last
-        self._started = False
         self._io = DriverIo(self, p)
         self._output = self.create_publisher(
             Float64, topics.REFERENCE, messages.KEPT_QOS if p.lockstep else messages.DEPTH
@@ -48,24 +47,20 @@ class ReferenceNode(ProcessNode):
             f'{p.waveform}, sample_period {p.sample_period:g} s'
             + (f'; waits for {awaited}' if p.wait_for_subscribers else '')
         )
-        self.call_when(
-            lambda: self._output.get_subscription_count() >= p.wait_for_subscribers, self._start,
-            awaited,
+        self.start_when(
+            lambda: self._output.get_subscription_count() >= p.wait_for_subscribers,
+            lambda: p.lockstep and self.create_subscription(
+                Clock, topics.CLOCK, self._on_clock, messages.KEPT_QOS
+            ), awaited,
         )
 
     def work(self, executor: PromptExecutor) -> None:
-        while not (self._started or self.stopping):
+        while not (self.started or self.stopping):
             executor.spin_once()
         if self.settings.lockstep:
             super().work(executor)
         else:
             self._follow(executor)
-
-    def _start(self) -> None:
-        self._started = True
-        if self.settings.lockstep:
-            self.create_subscription(Clock, topics.CLOCK, self._on_clock, messages.KEPT_QOS)
-        emit('ready')
 
     def _follow(self, executor: PromptExecutor) -> None:
         """Publish y_m half a period after each output, by the own clock where none comes.

@@ -73,7 +73,7 @@ class ProcessNode(ParameterNode):
         self.log = Node.get_logger(self)
         self.declare_settings(parameters_of or executable, reconfigurable)
         self.signals: list[int] = []
-        self.exit_code = DONE
+        self.exit_code, self.started = DONE, False
 
     @property
     def stopping(self) -> bool:
@@ -120,6 +120,17 @@ class ProcessNode(ParameterNode):
                 self.log.info(f'waiting for {awaited}')
 
         timer = self.every(0.01, look)
+
+    def start_when(
+        self, condition: Callable[[], bool], start: Callable[[], object], awaited: str,
+    ) -> None:
+        """Call start as soon as condition holds, and tell that the node is ready."""
+        def ready() -> None:
+            start()
+            self.started = True
+            emit('ready')
+
+        self.call_when(condition, ready, awaited)
 
 
 def run(
