@@ -14,7 +14,7 @@ from backlash_ros.core.control.paper_structure import PolePlacement, Proportiona
 from backlash_ros.core.control.protocol import ControlStructure
 from backlash_ros.core.control.serial_plant import DOUBT, SerialPlant
 from backlash_ros.core.control.tracking.design import Weights, better_design, design, power_gain
-from backlash_ros.core.control.tracking.lq_preview import preview_gains
+from backlash_ros.core.control.tracking.preview import preview_gains
 from backlash_ros.core.control.tracking.tracking import Tracking
 from backlash_ros.core.estimate import Bounds, Estimate
 from backlash_ros.core.estimates_file import load_estimate

@@ -10,7 +10,7 @@ from backlash_ros.core.assembly import build_controller, build_model, build_plan
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.tracking.design import Weights, design, tolerates
 from backlash_ros.core.control.tracking.feedback import shrunk_crossings
-from backlash_ros.core.control.tracking.lq_preview import preview_gains
+from backlash_ros.core.control.tracking.preview import preview_gains
 from backlash_ros.core.control.tracking.rest import SHORT, Mode, Rest
 from backlash_ros.core.control.tracking.trajectory import TrajectoryState
 from backlash_ros.core.estimate import Estimate, Status

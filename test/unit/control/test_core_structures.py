@@ -16,8 +16,12 @@ from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.paper_structure import LARGEST_F_OVER_M, Proportional
 from backlash_ros.core.control.protocol import Command, ControlInput
 from backlash_ros.core.control.tracking.design import power_gain
-from backlash_ros.core.control.tracking.lq_preview import PreviewGains, preview_gains
-from backlash_ros.core.control.tracking.reference_window import ReferenceWindow, averages
+from backlash_ros.core.control.tracking.preview import (
+    PreviewGains,
+    ReferenceWindow,
+    averages,
+    preview_gains,
+)
 from backlash_ros.core.parameters import ParameterError
 from backlash_ros.core.plant.numerics import place_poles
 from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction

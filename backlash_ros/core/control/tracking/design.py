@@ -11,8 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.control.tracking.lq_preview import PreviewGains, preview_gains
-from backlash_ros.core.control.tracking.reference_window import averages
+from backlash_ros.core.control.tracking.preview import PreviewGains, averages, preview_gains
 from backlash_ros.core.parameters import ParameterError
 from backlash_ros.core.plant.numerics import riccati
 from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction, powers
@@ -44,12 +43,11 @@ class Weights(NamedTuple):
     preview: int
 
 
-@dataclass(frozen=True)
-class Plan:
+class Plan(NamedTuple):
     """One ideal trajectory.
 
-    closed: transition of z = [x*; q*], (n + 1, n + 1). states (L, n + 1), references (L, N + 1): u*
-    of the next L samples, of z and the references. noise_gains: see ReferenceWindow. x_noise:
+    closed: transition F of z = [x*; q*], (n + 1, n + 1). states (L, n + 1), references (L, N + 1):
+    u* of the next L samples, of z and the references. noise_gains: see ReferenceWindow. x_noise:
     covariance (n, n) of x* for noise of 1 in references, for each of their averages.
     """
 
@@ -59,22 +57,6 @@ class Plan:
     references: Array
     noise_gains: Array
     x_noise: tuple[Array, ...]
-
-    def replayed(self, model: StateModel, references: Array) -> tuple[list[float], float]:
-        """x* and q* at the sample of the newest window, from rest at the oldest reference.
-
-        z(k+1) = F z(k) + [B; 0] u_p + [0; 1] r with u_p = -sum f_j r(k+j).
-        """
-        n = model.order
-        inputs = np.zeros((n + 1, 2))
-        inputs[:n, 0], inputs[n, 1] = model.b, 1.0
-        by_preview = -np.convolve(references, self.gains.preview[::-1], 'valid')
-        steps = len(by_preview) - 1  # the newest one makes the next state
-        start = np.append(model.equilibrium * references[0], 0.0)
-        pairs = np.column_stack([by_preview[:steps], references[:steps]])[::-1]
-        z = np.linalg.matrix_power(self.closed, steps) @ start + np.einsum(
-            'kij,kj->i', powers(self.closed, inputs, steps), pairs)
-        return z[:n].tolist(), float(z[n])
 
 
 @dataclass(frozen=True)
@@ -125,10 +107,7 @@ class TrackingDesign:
 
 
 def design(model: StateModel, weights: Weights, weight_factor: float = 1.0) -> TrackingDesign:
-    """The gains for a model of G; weight_factor: see `feedback_around`.
-
-    Raises ParameterError where no gains exist.
-    """
+    """The gains for a model of G; raises ParameterError where there are none."""
     rest_bandwidth = 1.0 / 80.0  # rad per sample, up to which y is corrected at rest
     # A slope, in first guesses. Plants that bear less are led astray by any feedback that would
     # help, and learn faster than they go astray without.
@@ -152,13 +131,11 @@ def design(model: StateModel, weights: Weights, weight_factor: float = 1.0) -> T
 def better_design(
     model: StateModel, weights: Weights, present: TrackingDesign,
 ) -> TrackingDesign | None:
-    """Return the design for a better model of G, None where it is no safe replacement.
-
-    Its loop has to keep a modulus margin that is safe in any case, or at least that of the present
-    loop around its own G or around the better one. The weight of its input is raised as far as this
-    takes and no further: it is the measure for the next G.
-    """
-    needed = 0.5  # no sensitivity above 2
+    """Return the design for a better model of G, None where it is no safe replacement."""
+    # The modulus margin that is safe in any case, without a sensitivity above 2, or else that of
+    # the present loop around its own G or around the better one. The weight of the input is raised
+    # as far as this takes and no further: the loop is the measure for the next G.
+    needed = 0.5
     try:
         for weight_factor in SAFER:
             reached = modulus_margin(model, model, feedback_around(model, weights, weight_factor))
@@ -173,10 +150,7 @@ def better_design(
 
 
 def feedback_around(model: StateModel, weights: Weights, weight_factor: float) -> PreviewGains:
-    """Of deviations from the trajectory, as if the input weighed `weight_factor` times as much.
-
-    Raises ParameterError where no gains exist.
-    """
+    """Of deviations from the trajectory, as if the input weighed `weight_factor` times as much."""
     rho = weights.input_weight * power_gain(model.transfer_function, np.pi / 10.0)
     return preview_gains(model, weight_factor * rho, weights.integral_weight)
 
@@ -233,19 +207,13 @@ def _plan(model: StateModel, gains: PreviewGains) -> Plan:
 
 
 def tolerates(model: StateModel, gain: Array, factor: float) -> bool:
-    """Whether feedback keeps its G stable although u acts `factor` times as strongly.
-
-    The observer does not know of the factor. The gap itself is left out: it limits what u can do
-    wrong, but not for ever.
-    """
+    """Whether feedback keeps G stable although u acts so many times as strongly as believed."""
+    # The gap itself is left out: it limits what u can do wrong, but not for ever.
     return all(_is_stable(model, model, gain, 0.0, each, factor) for each in CONFIDENCES)
 
 
 def modulus_margin(plant: StateModel, model: StateModel, gains: PreviewGains) -> float:
-    """Distance of the open loop L from -1, min |1 + L| over all frequencies.
-
-    For the worst of the observers; 0 where the loop is unstable with one of them.
-    """
+    """min |1 + L| of the open loop L with the worst of the observers; 0 where one is unstable."""
     if not all(_is_stable(plant, model, gains.state, gains.integral, each) for each in CONFIDENCES):
         return 0.0
     return min(_distance(plant, model, gains, each) for each in CONFIDENCES)

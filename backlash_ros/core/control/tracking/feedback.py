@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.control.protocol import LARGEST_FEEDBACK, LARGEST_IN_ACQUISITION
-from backlash_ros.core.control.tracking.design import SOFTEST, Gain, TrackingDesign, dot
+from backlash_ros.core.control.tracking.design import SOFTEST, TrackingDesign, dot
 from backlash_ros.core.control.tracking.rest import ARRIVED, ASTRAY, CLOSE, TOLERANCE, UNCERTAIN
 from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.plant.backlash import Region
@@ -31,73 +31,55 @@ SHARP, SHARP_COUNTS = 0.01, 17
 
 @dataclass
 class Trust:
-    """What was made of the estimates so far.
+    """What was made of the estimates so far."""
 
-    known: whether the newest comes from data of this loop. slope, crossings: that are inverted,
-    crossings shrunk by their uncertainty. held_for: samples for which estimates have held, sharp
-    ones counted sharp_counts times. in_use_for: samples since there is one.
-    """
-
-    known: bool = False
-    slope: float = nan
-    crossings: tuple[float, float] = (0.0, 0.0)
-    held_for: int = 0
-    in_use_for: int = 0
+    known: bool = False  # whether the newest comes from data of this loop
+    slope: float = nan  # that is inverted
+    crossings: tuple[float, float] = (0.0, 0.0)  # that are inverted, shrunk by their uncertainty
+    held_for: int = 0  # samples for which estimates have held, sharp ones count more often
+    in_use_for: int = 0  # samples since there is one
     sharp_counts: int = SHARP_COUNTS
 
     @property
     def full(self) -> bool:
-        """Whether an estimate has held for long enough."""
         return self.held_for >= TRUSTED_AFTER
 
 
 @dataclass
 class FeedbackState:
-    """What feedback remembers.
+    """What feedback remembers."""
 
-    integral: q - q*. level, free: place in the schedule while v does not follow, and samples since
-    it does again. bounded: whether feedback met its bound the sample before. width: bound in scales
-    while the backlash is unknown. asked: largest |u*| so far. blind_for: samples from now on in
-    which x_hat cannot be known.
-    """
-
-    integral: float = 0.0
-    level: int = 0
-    free: int = 0
-    bounded: bool = False
-    width: float = 1.0
-    asked: float = 0.0
-    blind_for: int = 1
+    integral: float = 0.0  # q - q*
+    level: int = 0  # place in the schedule while v does not follow
+    free: int = 0  # samples since it does again
+    bounded: bool = False  # whether feedback met its bound the sample before
+    width: float = 1.0  # bound in scales while the backlash is unknown
+    asked: float = 0.0  # largest |u*| so far
+    blind_for: int = 1  # samples from now on in which x_hat cannot be known
 
 
 class DeviationNoise(NamedTuple):
-    """How much of x_hat - x* may be noise: of y, of x_hat, and of the references that make x*.
+    """How much of x_hat - x* may be noise: of y, of x_hat, and of the references that make x*."""
 
-    x_cov: of x_hat, None where it is unknown. x_std: of |x_hat|. u_std: of K (x_hat - x*) for every
-    gain of the schedule, and at least K times errors of y of half its noise, as configured.
-    ignored: |x_hat - x*| that is left alone. tolerated: that is worth no crossing.
-    """
-
-    u_std: list[float]
-    x_cov: Array | None = None
-    x_std: float = 0.0
-    ignored: float = 0.0
-    tolerated: float = 0.0
+    u_std: list[float]  # of K (x_hat - x*) for each gain, at least K times half the noise of y
+    x_cov: Array | None = None  # of x_hat, None where it is unknown
+    x_std: float = 0.0  # of |x_hat|
+    ignored: float = 0.0  # |x_hat - x*| that is left alone
+    tolerated: float = 0.0  # |x_hat - x*| that is worth no crossing
 
 
 class StateFeedback:
     """Gains of a design, used as far as the estimate is trusted.
 
     While nothing is known the acquisition gain replaces K, and the trajectory itself excites the
-    backlash. shrinkage: standard deviations by which crossings are shrunk. noise_std: of y. gap_u:
-    u that the gap takes.
+    backlash. shrinkage: standard deviations by which crossings are shrunk. noise_std: of y.
     """
 
     def __init__(self, design: TrackingDesign, shrinkage: float, noise_std: float) -> None:
         self.trust, self.state = Trust(), FeedbackState()
         self._shrinkage, self._y_std = shrinkage, noise_std
         self._newest: Estimate | None = None
-        self.gap_u = 0.0
+        self.gap_u = 0.0  # that the gap takes
         self.use(design)
 
     def use(self, design: TrackingDesign) -> None:
@@ -110,11 +92,8 @@ class StateFeedback:
         self._quiet = self._in_use = 0
 
     def go_on_from(self, other: StateFeedback, state_known: bool) -> None:
-        """Go on where another one is; from the softest, where x_hat begins anew and full of noise.
-
-        state_known: whether it does not.
-        """
-        self.trust, self.state, self.gap_u = replace(other.trust), replace(other.state), other.gap_u
+        """Go on where another one is; from the softest, where x_hat begins anew, full of noise."""
+        self.trust, self.state, self.gap_u = other.trust, other.state, other.gap_u
         self.prepare(other.noise.x_cov, self._y_std)
         if not state_known:
             self.trust = Trust(sharp_counts=1)
@@ -138,10 +117,7 @@ class StateFeedback:
         return True
 
     def begin(self, ideal: float, estimate: Estimate, first: bool) -> None:
-        """Note u* of this sample, the scale of what is allowed, and count it for the estimate.
-
-        first: of this loop; an estimate was known before then.
-        """
+        """Note u* of this sample, and count it for the estimate; first: of this loop."""
         trust, gap = self.trust, estimate.c_r - estimate.c_l
         self.state.asked, self.gap_u = max(self.state.asked, abs(ideal)), estimate.m * gap
         if not (trust.known and estimate.learned):
@@ -150,7 +126,7 @@ class StateFeedback:
             return
         trust.in_use_for += 1
         if first:
-            trust.held_for = TRUSTED_AFTER
+            trust.held_for = TRUSTED_AFTER  # it was known before
         elif not trust.full:
             # Beside far larger u even a gap that is hardly known makes little difference.
             large = max(gap, self.state.width * self._scale / estimate.m)
@@ -162,10 +138,7 @@ class StateFeedback:
         self, x_cov: Array | None, y_std: float, x_noise: Array | None = None,
         reference_std: float = 0.0,
     ) -> None:
-        """Take in how noisy this sample is, and choose the gain that it allows.
-
-        y_std: as measured. x_noise: covariance of x* for noise of 1 in the references.
-        """
+        """Choose the gain that noise allows; x_noise: covariance of x* for noise of 1 in r."""
         u_std, _, x_std, *_ = self.noise
         deviation_std = 0.0
         if x_cov is not None:
@@ -191,11 +164,6 @@ class StateFeedback:
             return [0.0] * len(x)
         return [float(x_hat[i]) - each for i, each in enumerate(x)]
 
-    @property
-    def knows_noise(self) -> bool:
-        """Whether full feedback can tell a deviation from noise."""
-        return self.trust.full and self.noise.x_cov is not None
-
     def u(
         self, deviation: Sequence[float], held_back: bool, largest: float,
     ) -> tuple[float, float]:
@@ -203,12 +171,24 @@ class StateFeedback:
 
         held_back: whether v met its limits, or is on its way across the gap. largest: |x*| so far.
         """
-        widening = 1.03  # per sample, of the bound on feedback while the backlash is unknown
-        state, most, begun = self.state, self.most, self.trust.held_for > 0
-        if begun:
-            off, noise = hypot(*deviation), self.noise
+        # Per sample, of the bound while the backlash is unknown; samples without a limit after
+        # which feedback takes a step back to full.
+        widening, stiffen_after = 1.03, 20
+        state, trust, most, noise = self.state, self.trust, self.most, self.noise
+        if trust.held_for:
+            off = hypot(*deviation)
+            if held_back or state.bounded:
+                state.free, state.level = 0, min(state.level + 1, SOFTEST)
+            else:
+                state.free += 1
+                if state.level > 0 and state.free % stiffen_after == 0:
+                    state.level -= 1
+            # K, or the less of it the longer v does not follow, and the newer the estimate. Far
+            # away, beyond what x* has been and noise explains, it does not matter what noise does.
             astray = off > max(largest, ASTRAY / ARRIVED * noise.ignored)
-            feedback = worth = dot(self._gain(held_back or state.bounded, astray), deviation)
+            unproven = SOFTEST - trust.held_for * (SOFTEST + 1) // TRUSTED_AFTER
+            self._in_use = max(state.level, unproven, 0 if astray else self._quiet)
+            feedback = worth = dot(self._design.schedule[self._in_use], deviation)
             if self.knows_noise:
                 feedback *= 1.0 - noise.ignored / max(off, noise.ignored)
                 worth *= 1.0 - noise.tolerated / max(off, noise.tolerated)
@@ -217,10 +197,10 @@ class StateFeedback:
             if not -most < feedback < most:
                 # A gap wider than the first guess has to be crossed some day.
                 state.width = min(widening * state.width, LARGEST_IN_ACQUISITION)
-        if self.trust.full:
+        if trust.full:
             by_integral = self._design.feedback.integral * state.integral
             feedback, worth = feedback + by_integral, worth + by_integral
-        state.bounded = begun and not -most <= feedback <= most
+        state.bounded = trust.held_for > 0 and not -most <= feedback <= most
         if isnan(feedback):
             return 0.0, 0.0
         return min(max(feedback, -most), most), min(max(worth, -most), most)
@@ -228,10 +208,7 @@ class StateFeedback:
     def furthest(
         self, deviation: Sequence[float], ahead: Sequence[float], side: Region, turns_in: int,
     ) -> float:
-        """The furthest u that v can hold and never be asked to come back from until u* turns.
-
-        ahead: u* from this sample on. side: on which v is. turns_in: samples until u* turns.
-        """
+        """The furthest u that v can hold and never be asked to come back from until u* turns."""
         by_state, by_u = self._holding[self._in_use]
         agreed = side * (by_state @ deviation + by_u @ ahead)[:turns_in]
         return side * float(agreed.min(initial=inf))
@@ -244,8 +221,9 @@ class StateFeedback:
             self.state.integral += difference
 
     @property
-    def _scale(self) -> float:
-        return max(self.state.asked, self.gap_u)
+    def knows_noise(self) -> bool:
+        """Whether full feedback can tell a deviation from noise."""
+        return self.trust.full and self.noise.x_cov is not None
 
     @property
     def noise_u(self) -> float:
@@ -253,16 +231,16 @@ class StateFeedback:
         return self.noise.u_std[self._quiet]
 
     @property
-    def most(self) -> float:
-        """Largest feedback.
+    def _scale(self) -> float:
+        return max(self.state.asked, self.gap_u)
 
-        While the backlash is unknown a wrong slope may make the loop unstable, which bounded
-        feedback slows down. Once it is known no error of y that would not matter at rest calls for
-        too much.
-        """
+    @property
+    def most(self) -> float:
+        """Largest feedback."""
         if not self.trust.held_for:
+            # A wrong slope may make the loop unstable, which bounded feedback slows down.
             return self.state.width * self._scale
-        # |K|: what full feedback makes of an error of y.
+        # No error of y that would not matter at rest calls for too much; |K| is what it calls for.
         by_noise = TOLERANCE * self._y_std * hypot(*self._design.schedule[0])
         return LARGEST_FEEDBACK * max(self._scale, by_noise)
 
@@ -271,34 +249,16 @@ class StateFeedback:
         """Largest |u_d - u*|, whatever makes u_d."""
         return self.most if self.trust.held_for else LARGEST_IN_ACQUISITION * self._scale
 
-    def _gain(self, held_back: bool, astray: bool) -> Gain:
-        """K, or the less of it the longer v does not follow, and the newer the estimate.
-
-        astray: whether y is further away than the trajectory has gone so far, and than noise
-        leads it: then it does not matter what noise makes v do.
-        """
-        stiffen_after = 20  # samples without a limit after which feedback takes a step back to full
-        state = self.state
-        state.free = 0 if held_back else state.free + 1
-        if held_back:
-            state.level = min(state.level + 1, SOFTEST)
-        elif state.level > 0 and state.free % stiffen_after == 0:
-            state.level -= 1
-        unproven = SOFTEST - self.trust.held_for * (SOFTEST + 1) // TRUSTED_AFTER
-        self._in_use = max(state.level, unproven, 0 if astray else self._quiet)
-        return self._design.schedule[self._in_use]
-
 
 def shrunk_crossings(estimate: Estimate, deviations: float, known: bool) -> tuple[float, float]:
     """Crossings shrunk towards each other by their uncertainty; both 0 while nothing is known.
 
     Over-compensation drives past the gap and starts a limit cycle, under-compensation only leaves
-    a rest of the backlash: in a loop around y the smaller gap is the safe one. Where a law knows
-    no uncertainty there is nothing to shrink by once the crossings are known.
+    a rest of the backlash: in a loop around y the smaller gap is the safe one.
     """
     if deviations == 0.0:
         return estimate.c_r, estimate.c_l
-    if isnan(estimate.std_c_r):
+    if isnan(estimate.std_c_r):  # a law that knows no uncertainty
         return (estimate.c_r, estimate.c_l) if known else (0.0, 0.0)
     middle = 0.5 * (estimate.c_r + estimate.c_l)
     return (max(estimate.c_r - deviations * estimate.std_c_r, middle),

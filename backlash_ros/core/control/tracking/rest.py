@@ -54,27 +54,20 @@ class Mode(Enum):
 
 @dataclass
 class Rest:
-    """Decides whether v rests, and steps it there.
-
-    target: u_d where v rests, and the standard deviations by which the crossings are shrunk for it.
-    largest: |x*| so far. limit: tolerance in use. rested: samples for which the trajectory has.
-    returns, leads: how often y was brought back since, by full feedback and gently. turns, side: of
-    v in this return, and the newest line. near: samples since y was last away. pull: u - u* with
-    which leading back began.
-    """
+    """Decides whether v rests, and steps it there."""
 
     design: TrackingDesign
     mode: Mode = Mode.HOLD
-    target: tuple[float, float] = (0.0, 0.0)
-    side: Region = Region.GAP
-    largest: float = 0.0
-    limit: float = 0.0
-    rested: int = 0
-    returns: int = 0
-    leads: int = 0
-    turns: int = 0
-    near: int = 0
-    pull: float = 0.0
+    target: tuple[float, float] = (0.0, 0.0)  # u_d where v rests, deviations to shrink its crossing
+    side: Region = Region.GAP  # newest line
+    largest: float = 0.0  # |x*| so far
+    limit: float = 0.0  # tolerance in use
+    rested: int = 0  # samples for which the trajectory has
+    returns: int = 0  # how often y was brought back since by full feedback
+    leads: int = 0  # and gently
+    turns: int = 0  # of v in this return
+    near: int = 0  # samples since y was last away
+    pull: float = 0.0  # u - u* with which leading back began
 
     def decide(
         self, y: float, noise_std: float, r: float, spread: float, plan: TrajectoryState,
@@ -82,9 +75,8 @@ class Rest:
     ) -> Mode:
         """Set the mode for this sample.
 
-        noise_std: of y. r: the reference now. spread: of it and those to come, beyond their noise.
-        deviation: x_hat - x*. x_std: standard deviation of x_hat, None where it is unknown. side:
-        line in use. pull: see `pull_back`. acts: whether feedback asks for more than its noise.
+        spread: of the references, beyond their noise. x_std: of x_hat, None where it is unknown.
+        side: line in use. pull: see `pull_back`. acts: whether feedback asks for more than noise.
         """
         self.largest = max(self.largest, hypot(*plan.x))
         least = 1e-5 * self.largest  # tolerance, where that is more
@@ -140,10 +132,7 @@ class Rest:
         self, estimate: Estimate, ideal: float, noise: float, pull: float,
         inverse: BacklashInverse, begins: bool,
     ) -> None:
-        """Aim v at where it is to rest, where that is better than to stay.
-
-        ideal: u*, with so much noise. begins: whether the mode has changed with this sample.
-        """
+        """Aim v at where it is to rest, where that is better than to stay; ideal: u*, and noise."""
         if begins:
             self.stay(inverse)
         if inverse.taking_up or inverse.side is Region.GAP:

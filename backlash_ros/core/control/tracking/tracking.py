@@ -28,17 +28,13 @@ FADING = 0.8  # per sample, of what is handed over
 
 @dataclass
 class HandOver:
-    """Whoever takes over v, and whatever it takes it over with, v goes on from where it is.
+    """Whoever takes over v, and whatever it takes it over with, v goes on from where it is."""
 
-    What v stands for then differs from the u_d that would have led to it: that is added to u_d, and
-    fades. due: that u_d, where somebody takes over with the next sample. widens: whether what is
-    added may lead u_d further than feedback may. leading: whether the reference may have gone on.
-    """
-
+    # By which what v stands for differs from the u_d that would have led to it: added to u_d.
     added: float = 0.0
-    due: float | None = None
-    widens: bool = False
-    leading: bool = False
+    due: float | None = None  # that u_d, where somebody takes over with the next sample
+    widens: bool = False  # whether what is added may lead u_d further than feedback may
+    leading: bool = False  # whether the reference may have gone on while nobody followed it
 
 
 class Tracking(ControlStructure):
@@ -71,12 +67,11 @@ class Tracking(ControlStructure):
     def may_change(self) -> bool:
         """Whether v neither crosses the gap nor is about to."""
         # Samples after the first estimate, by then v has crossed the gap with it; after a crossing,
-        # by then its last moves are over; and in which u* is neither to turn nor to hurry.
+        # by then its last moves are over; in which u* must not turn or move v more than of late.
         settled_after, engaged_after, foreseen = 150, 5, 6
         trust, plan = self.feedback.trust, self.trajectory.state
         if trust.in_use_for < settled_after or self._engaged_for < engaged_after:
             return False
-        # Neither a turn soon nor larger moves of v than those of late, as far as references say.
         fastest, ahead = trust.slope * max(self._moves), plan.ahead[:foreseen + 1]
         rounding = 1e-9 * max(map(abs, ahead))
         return all(-rounding <= (after - before) * plan.side <= fastest + rounding
@@ -88,17 +83,14 @@ class Tracking(ControlStructure):
         """Take over the trajectory, and the model of G that it is one of."""
         if not isinstance(other, Tracking) or other.delay != self.delay:
             return
-        if other._design.model is not self._design.model:
-            self._use(design(other._design.model, self._weights))
-        self.trajectory.go_on_from(other.trajectory)
-        self.feedback.go_on_from(other.feedback, state_known)
-        self.rest = replace(other.rest, design=self._design)
+        self.trajectory, self.rest, self._newest = other.trajectory, other.rest, other._newest
         self._moves, self._engaged_for = other._moves, other._engaged_for
-        self._newest = other._newest
+        model = other._design.model
+        self._use(self._design if model is self._design.model else design(model, self._weights))
+        self.feedback.go_on_from(other.feedback, state_known)
         self.hand_over = HandOver(0.0, self.trajectory.state.u, not state_known, not state_known)
 
     def redesign(self, model: StateModel) -> Callable[[], object | None]:
-        """See `better_design`."""
         return partial(better_design, model, self._weights, self._design)
 
     def adopt(self, gains: object, source: StateSource) -> None:

@@ -8,15 +8,16 @@ seen before it comes. That decides on which side v is: once per turn, however no
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from math import ceil, dist, isnan, nan
 
 import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.control.tracking.design import TrackingDesign, dot
-from backlash_ros.core.control.tracking.reference_window import ReferenceWindow
+from backlash_ros.core.control.tracking.preview import ReferenceWindow
 from backlash_ros.core.plant.backlash import Region
+from backlash_ros.core.plant.transfer_function import powers
 
 Array = NDArray[np.float64]
 
@@ -25,25 +26,18 @@ QUIET = 0.02  # share of the u that the gap takes, by which noise of the referen
 
 @dataclass
 class TrajectoryState:
-    """Where the trajectory is, and where it goes.
+    """Where the trajectory is, and where it goes."""
 
-    x, q: x* (n,) and q*. side: on which u* moves, GAP until it does. extreme: the furthest u* in
-    that direction. decided: samples for which the side stays. turns_in: samples until u* turns, or
-    all that are known ahead. furthest: u* to which u is to go without turning. ahead: u* from this
-    sample on. moved: by how much x* did. noise_band: how far the noise of the references may turn
-    u*.
-    """
-
-    x: list[float]
-    q: float = 0.0
-    side: Region = Region.GAP
-    extreme: float = nan
-    decided: int = 0
-    turns_in: int = 0
-    furthest: float = nan
-    ahead: list[float] = field(default_factory=lambda: [0.0])
-    moved: float = 0.0
-    noise_band: float = 0.0
+    x: list[float]  # x*, shape (n,)
+    q: float = 0.0  # q*
+    side: Region = Region.GAP  # on which u* moves
+    extreme: float = nan  # furthest u* on it
+    decided: int = 0  # samples for which it stays
+    turns_in: int = 0  # samples until u* turns, or all that are known ahead
+    furthest: float = nan  # u* to which u goes without turning
+    ahead: list[float] = field(default_factory=lambda: [0.0])  # u* from this sample on
+    moved: float = 0.0  # by how much x* did
+    noise_band: float = 0.0  # how far noise of the references may turn u*
 
     @property
     def u(self) -> float:
@@ -80,16 +74,8 @@ class IdealTrajectory:
         self._transition: list[tuple[list[float], float]] = list(
             zip(design.model.a.tolist(), design.model.b.tolist(), strict=True))
 
-    def go_on_from(self, other: IdealTrajectory) -> None:
-        """Be where another trajectory of the same model is."""
-        self.references, self.state = other.references, replace(other.state)
-        self.use(self._design, other.softness)
-
     def soften(self, gap_u: float) -> bool:
-        """Ask for less where noise of the references makes u* cross a gap that takes this u.
-
-        Returns whether it does.
-        """
+        """Ask for less where noise of references makes u* cross a gap of this u; say if so."""
         # What each plan makes of noise that is averaged over the widest parabola.
         of_noise = [plan.noise_gains.item(-1) for plan in self._design.plans]
         now, noise_std = of_noise[self.softness], self.references.noise_std
@@ -103,10 +89,20 @@ class IdealTrajectory:
         return True
 
     def replay(self) -> None:
-        """Be where this design would be, had it been in use as long as references are kept."""
-        state, plan, references = self.state, self._plan, self.references
-        state.x, state.q = plan.replayed(self._design.model, references.all())
-        state.ahead = self._ahead(references.window, plan.references)
+        """Be where this design would be, from rest at the oldest reference that is kept on."""
+        state, plan, model = self.state, self._plan, self._design.model
+        # z(k+1) = F z(k) + [B; 0] u_p + [0; 1] r with u_p = -sum f_j r(k+j).
+        n, references = model.order, self.references.all()
+        inputs = np.zeros((n + 1, 2))
+        inputs[:n, 0], inputs[n, 1] = model.b, 1.0
+        by_preview = -np.convolve(references, plan.gains.preview[::-1], 'valid')
+        steps = len(by_preview) - 1  # the newest one makes the next state
+        start = np.append(model.equilibrium * references[0], 0.0)
+        pairs = np.column_stack([by_preview[:steps], references[:steps]])[::-1]
+        z = np.linalg.matrix_power(plan.closed, steps) @ start + np.einsum(
+            'kij,kj->i', powers(plan.closed, inputs, steps), pairs)
+        state.x, state.q = z[:n].tolist(), float(z[n])
+        state.ahead = self._ahead(self.references.window, plan.references)
 
     def begin(self, r: float) -> None:
         """Rest at y = r."""
@@ -129,9 +125,8 @@ class IdealTrajectory:
     def turn(self, noise_std: float, gap_u: float, band: float, crossing: float) -> bool:
         """Decide on which side v is to be at this sample; returns whether it is another one.
 
-        noise_std: of y. gap_u: u that the gap takes. band: of u*; a turn by less is one only if it
-        lasts for as long as the references are known. crossing: samples that v takes across the
-        gap; it leaves for the other side as much before the turn as it arrives after it.
+        noise_std: of y. gap_u: u that the gap takes. band: of u*, see `_turn`. crossing: samples
+        that v takes across the gap; it leaves as much before the turn as it arrives after it.
         """
         state, ahead = self.state, self.state.ahead
         if isnan(state.extreme):
