@@ -113,7 +113,7 @@ class AdaptiveController:
 
     def command_of(self, v: float) -> float:
         """The command at which the motor rests at a v that was reported."""
-        return v if self._serial is None else self._serial.command_of(v)
+        return v if self._serial is None else v / self._serial.actuator.gain
 
     def start_from(self, v: float) -> None:
         """Say which command acts now, so that the first one goes on from there."""
@@ -122,10 +122,7 @@ class AdaptiveController:
         self.inverse.start_from(v)
 
     def go_on_from(self, before: AdaptiveController) -> None:
-        """Take over from the controller before this one, as the state of the plant got unknown.
-
-        v, the line that is engaged and the learned model of G stay.
-        """
+        """Take over v and the learned G as the state of the plant got unknown; `before` ends."""
         own, self.inverse = self.inverse, copy(before.inverse)
         self.inverse.direction_band, self.inverse.take_up = own.direction_band, own.take_up
         self.motion = before.motion
@@ -149,7 +146,7 @@ class AdaptiveController:
 
     @property
     def _source(self) -> StateSource:
-        return self.estimator if self._serial is None else self._serial
+        return self.estimator if self._serial is None else self._serial.observer
 
 
 @dataclass

@@ -12,13 +12,9 @@ class BacklashInverse:
     """v = BI(u_d): crosses the gap whenever u_d turns; exact (2.2) with the true m, c_r, c_l.
 
     direction_band: u_d has turned only when it came back from its extreme by more than this
-        [unit of u_d]; until then v is held. 0 is the printed inverse.
-    take_up: largest move of v per sample while the gap is crossed (2.3: "a line segment with a
-        finite slope"), and over to a line that new estimates have moved by more than that, until
-        u moves or, after slow_down, until it is there [unit of v]; inf jumps.
-    side: line in use; GAP until u_d moves for the first time. extreme: furthest u_d in the present
-        direction. taking_up: whether v is still on its way to the line. limited: whether the last
-        v could not be applied as it was.
+    [unit of u_d]; 0 is the printed inverse. take_up: largest move of v per sample while the gap is
+    crossed (2.3: "a line segment with a finite slope"), and over to a line that new estimates have
+    moved by more than that, until u moves [unit of v]; inf jumps.
     """
 
     def __init__(self, direction_band: float = 0.0, take_up: float = inf) -> None:
@@ -27,9 +23,11 @@ class BacklashInverse:
         if not take_up > 0.0:
             raise ParameterError('inverse.take_up_rate', take_up, 'must be > 0')
         self.direction_band, self.take_up = direction_band, take_up
+        # Line in use, GAP until u_d moves for the first time, and furthest u_d on it.
         self.v, self.side, self.extreme = 0.0, Region.GAP, 0.0
-        self.taking_up = self.limited = False
-        self._slowed = False  # whether v is on its way until it is where u_d wants it
+        self.taking_up = False  # whether v is still on its way to the line
+        self._slowed = False  # whether it is until it is where u_d wants it
+        self.limited = False  # whether the last v could not be applied as it was
         self._play = nan, nan, nan  # m, c_r, c_l in use the sample before
         self._u = 0.0  # what they make of v, as long as v is on its way to a line
 
@@ -58,10 +56,7 @@ class BacklashInverse:
         return self.follow(side, u_d, m, c_r, c_l)
 
     def follow(self, side: Region, u_d: float, m: float, c_r: float, c_l: float) -> float:
-        """Return v for u_d on the line of a side; whoever calls this decides when u_d has turned.
-
-        On this line v only goes on: where u_d comes back, u is held.
-        """
+        """Return v for u_d on the line of a side, on which it only goes on; else u is held."""
         if side is Region.GAP:
             return self.v
         if self.side is Region.GAP:

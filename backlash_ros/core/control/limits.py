@@ -18,19 +18,15 @@ def plausible(value: float) -> bool:
 
 
 class Motion(NamedTuple):
-    """A command and how it moves, in the unit of v.
-
-    move: v(k) - v(k-1). target: the v that was asked for. pace: the move of the target.
-    """
+    """A command and how it moves, in the unit of v."""
 
     v: float
-    move: float = 0.0
-    target: float = 0.0
-    pace: float = 0.0
+    move: float = 0.0  # v(k) - v(k-1)
+    target: float = 0.0  # the v that was asked for
+    pace: float = 0.0  # the move of that
 
 
 def at_rest(v: float) -> Motion:
-    """The motion of an actuator that stands at v."""
     return Motion(v, 0.0, v)
 
 
@@ -55,19 +51,17 @@ class Limits:
     def go_on_from(self, told: float, known: float | None) -> float:
         """The v from which commands go on where others tell that it acts.
 
-        Whatever they tell leads no command out of the bounds, or further out than known is: the v
-        that acted before, None where nobody knows it. The bounds may have been narrowed since.
+        It is not out of the bounds, or no further than known: the v that acted before they told.
         """
         low, high = (self.low, self.high) if known is None else (
             min(self.low, known), max(self.high, known))
         return min(max(told, low), high)
 
     def apply(self, v: float, before: Motion) -> Motion:
-        """The motion that may be sent where v is asked for, after the motion before it.
+        """The motion that may be sent where v is asked for: within the bounds, or on the way there.
 
-        v is within the bounds, or as far on the way to them as one sample allows; it stays where
-        it is when what is asked for is no number. With a finite acceleration v brakes in time for
-        the bounds and for the target, and joins a target that moves steadily without a lag.
+        v stays where it is when what is asked for is no number. With a finite acceleration it
+        brakes in time for bounds and target, and joins one that moves steadily without a lag.
         """
         # Beyond the largest measurement nobody could tell what v does.
         target = min(max(before.v if isnan(v) else v, self.low, -LARGEST_SIGNAL), self.high,
@@ -114,10 +108,8 @@ class Limits:
         return -min(self._braking(-distance), self.move)
 
     def _braking(self, distance: float) -> float:
-        """The largest move now after which v can still come to rest within a distance >= 0.
-
-        A move of (n + f) times the acceleration takes n (n+1)/2 + (n+1) f of it until v rests.
-        """
+        """The largest move now after which v can still come to rest within a distance >= 0."""
+        # A move of (n + f) times the acceleration takes n (n+1)/2 + (n+1) f of it until v rests.
         way = distance / self.acceleration
         if way == inf:
             return inf
@@ -128,8 +120,7 @@ class Limits:
 def last_commands(action: str, motion: Motion, limits: Callable[[], Limits]) -> Iterator[float]:
     """Commands that follow after a motion, one per sample; the last one stays in force.
 
-    action: hold (v comes to rest), or zero and ramp, which go to the v nearest to 0 within the
-    limits as fast as these allow. limits: those that hold when the next command is made.
+    action: hold (v comes to rest), or zero and ramp: to the v nearest to 0 as fast as limits allow.
     """
     if action == 'hold':
         while (onward := limits().stop(motion)).v != motion.v:

@@ -17,13 +17,13 @@ LARGEST_IN_ACQUISITION, LARGEST_FEEDBACK = 10.0, 100.0
 
 
 class ControlInput(NamedTuple):
-    """What is known at a sample. crossing: samples that v takes across the gap, by its limits."""
+    """What is known at a sample."""
 
     y_m: float
     y: float
     estimate: Estimate
     source: StateSource
-    crossing: float = 0.0
+    crossing: float = 0.0  # samples that v takes across the gap, by its limits
 
 
 class Command(NamedTuple):
@@ -37,14 +37,14 @@ class Command(NamedTuple):
 class ControlStructure:
     """Makes u_d from the reference and drives the inverse with it.
 
-    Structures inherit from here what a better G does not change. delay: samples by which y is
-    meant to follow y_m. may_change: whether gains for a better G may take over at this sample.
+    Structures inherit from here what a better G does not change.
     """
 
-    delay: int = 0
+    delay: int = 0  # samples by which y is meant to follow y_m
 
     @property
     def may_change(self) -> bool:
+        """Whether gains for a better G may take over at this sample."""
         return True
 
     def control(self, inputs: ControlInput, inverse: BacklashInverse) -> Command:
@@ -55,18 +55,11 @@ class ControlStructure:
         """Do what the next command need not wait for; the next one does it where nobody asks."""
 
     def redesign(self, model: StateModel) -> Callable[[], object | None] | None:
-        """What makes the gains for a better G, for `adopt`; None where there are none to make.
-
-        It can be called in another process, and returns None where the result would be less safe
-        than what is in use.
-        """
+        """What makes gains for a better G in any process, or None if unsafe; None: none to make."""
         return None
 
     def adopt(self, gains: object, source: StateSource) -> None:
         """Use such gains from the next sample on, without a jump of v; source: of their x_hat."""
 
     def go_on_from(self, other: ControlStructure, state_known: bool = True) -> None:
-        """Take over from a structure that has made v until now, so that v does not jump.
-
-        state_known: whether x_hat still says where the plant is.
-        """
+        """Take over v from another structure; state_known: whether x_hat still says where G is."""

@@ -12,9 +12,6 @@ from collections import deque
 from dataclasses import replace
 from math import isnan, nan
 
-import numpy as np
-from numpy.typing import NDArray
-
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.estimation.settings import OUTLIERS
 from backlash_ros.core.law import Interval
@@ -23,21 +20,20 @@ from backlash_ros.core.plant.actuator import Actuator, Motor
 from backlash_ros.core.plant.backlash import clamp
 from backlash_ros.core.plant.transfer_function import StateModel
 
-Array = NDArray[np.float64]
-
 # Share of the motion of u that may not be what the backlash says, before and after it was learned.
 DOUBT, LITTLE_DOUBT = 0.5, 0.1
 
 
 class SerialPlant:
-    """Follows motor and plant from sample to sample: the source of x_hat for a structure.
+    """Follows motor and plant from sample to sample; model: G behind it. noise_std: of y.
 
-    model: G behind the motor. noise_std: of y.
+    observer: the source of x_hat of L G for a structure.
     """
 
     def __init__(self, actuator: Actuator, model: StateModel, noise_std: float) -> None:
-        self._actuator, self._noise_std, self._motor = actuator, noise_std, Motor(actuator)
-        self._play = self._commanded = nan  # what the gap holds, in units of v and of the command
+        self.actuator, self._noise_std, self._motor = actuator, noise_std, Motor(actuator)
+        # What the gap holds, in units of v and of the command: its middle where it begins.
+        self._play = self._commanded = nan
         self._learned = False
         # u and y, from which a new observer finds the state.
         self._newest: deque[tuple[float, float | None]] = deque(maxlen=60)
@@ -45,36 +41,22 @@ class SerialPlant:
 
     def before(self, model: StateModel) -> StateModel:
         """L G for a G."""
-        return StateModel(self._actuator.in_front_of(model.transfer_function))
+        return StateModel(self.actuator.in_front_of(model.transfer_function))
 
     def adopt(self, model: StateModel) -> None:
         """Give x_hat for this L G from now on."""
         self._model = model
         # It is told u: to the observer there is no backlash.
-        self._observer = FixedBacklash(Estimate(1.0, 0.0, 0.0, 0.0), model, self._noise_std,
+        self.observer = FixedBacklash(Estimate(1.0, 0.0, 0.0, 0.0), model, self._noise_std,
                                        LITTLE_DOUBT if self._learned else DOUBT)
         self._variance, self._taken, self._refused = 0.0, 0, 0
         for u, y in self._newest:
             self._follow(y, u)
 
-    @property
-    def x_hat(self) -> Array:
-        """State of L G in the coordinates of its model, shape (n,)."""
-        return self._observer.x_hat
-
-    @property
-    def x_cov(self) -> Array:
-        """Covariance of x_hat, shape (n, n)."""
-        return self._observer.x_cov
-
     def for_command(self, estimate: Estimate) -> Estimate:
         """The estimate with its crossings as the command meets them."""
-        c_r, c_l = self._actuator.crossings(estimate.c_r, estimate.c_l)
+        c_r, c_l = self.actuator.crossings(estimate.c_r, estimate.c_l)
         return replace(estimate, c_r=c_r, c_l=c_l)
-
-    def command_of(self, v: float) -> float:
-        """The command at which the motor rests at v."""
-        return v / self._actuator.gain
 
     def update(
         self, y: float | None, command: float, applied: float | None, estimate: Estimate,
@@ -83,15 +65,17 @@ class SerialPlant:
 
         Returns its v: as it was reported, else where the command takes the motor.
         """
-        c_r, c_l = estimate.c_r, estimate.c_l
-        play = command * self._actuator.gain + c_r if isnan(self._play) else self._play
+        c_r, c_l, gap = estimate.c_r, estimate.c_l, estimate.c_r - estimate.c_l
+        play = command * self.actuator.gain + c_r if isnan(self._play) else self._play
         position = self._motor.step(command, play - c_r, c_r, c_l)
         v = position if applied is None else applied
-        self._play = _played(self._play, v, estimate)
+        self._play = clamp(v + 0.5 * gap if isnan(self._play) else self._play, v, v + gap)
         # Nothing is known of the gap before it was learned.
         seen = self.for_command(
             estimate if estimate.learned else replace(estimate, c_r=0.0, c_l=0.0))
-        self._commanded = _played(self._commanded, command, seen)
+        gap = seen.c_r - seen.c_l
+        held = command + 0.5 * gap if isnan(self._commanded) else self._commanded
+        self._commanded = clamp(held, command, command + gap)
         if estimate.learned is not self._learned:
             self._learned = estimate.learned
             self.adopt(self._model)
@@ -102,7 +86,7 @@ class SerialPlant:
 
     def _follow(self, y: float | None, u: float) -> None:
         averaged = 100  # innovations, of whose rms y may differ: they come in bursts at crossings
-        observer = self._observer
+        observer = self.observer
         if y is not None and self._taken >= averaged:
             least = max(self._variance, self._noise_std**2)
             # So many outliers in a row are none.
@@ -115,9 +99,3 @@ class SerialPlant:
             self._taken += 1
             change = observer.innovation**2 - self._variance
             self._variance += change / min(self._taken, averaged)
-
-
-def _played(held: float, v: float, estimate: Estimate) -> float:
-    """What the gap holds at v; in its middle where nothing is known of before."""
-    gap = estimate.c_r - estimate.c_l
-    return clamp(v + 0.5 * gap if isnan(held) else held, v, v + gap)

@@ -54,10 +54,7 @@ class ReferenceSignal:
 
 
 def read_reference_file(p: Parameters) -> tuple[float, ...]:
-    """Values of the CSV with the header t,y_m and a row per sample period, from t = 0 on.
-
-    Empty for any other waveform. Raises ParameterError, naming the line.
-    """
+    """Values of the CSV with header t,y_m and a row per sample period; () for other waveforms."""
     if p.waveform != 'file':
         return ()
     if not p.file:

@@ -267,10 +267,10 @@ def test_feedback_softens_until_the_loop_is_as_safe_as_the_one_it_replaces() -> 
     softer = redesigned(motor(), motor(0.5), weights)
     assert softer is not None
     nominal = design(softer.model, weights)
-    had = min(modulus_margin(plant, present.feedback)
+    had = min(modulus_margin(plant, present.model, present.feedback)
               for plant in (present.model, softer.model))
-    assert modulus_margin(softer.model, nominal.feedback) < had
-    assert modulus_margin(softer.model, softer.feedback) >= had
+    assert modulus_margin(softer.model, softer.model, nominal.feedback) < had
+    assert modulus_margin(softer.model, softer.model, softer.feedback) >= had
     # The trajectory is not slower for it.
     assert softer.plans[0].gains.preview == pytest.approx(nominal.plans[0].gains.preview)
 

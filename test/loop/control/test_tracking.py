@@ -8,9 +8,9 @@ from scipy import signal
 
 from backlash_ros.core.assembly import build_controller, build_model, build_plant, build_reference
 from backlash_ros.core.control.inverse import BacklashInverse
-from backlash_ros.core.control.tracking.design import Weights, design, tolerates
+from backlash_ros.core.control.tracking.design import Weights, design, modulus_margin
 from backlash_ros.core.control.tracking.feedback import shrunk_crossings
-from backlash_ros.core.control.tracking.preview import preview_gains
+from backlash_ros.core.control.tracking.preview import PreviewGains, preview_gains
 from backlash_ros.core.control.tracking.rest import SHORT, Mode, Rest
 from backlash_ros.core.control.tracking.trajectory import TrajectoryState
 from backlash_ros.core.estimate import Estimate, Status
@@ -184,9 +184,9 @@ def test_feedback_by_the_first_guess_is_left_out_where_a_wrong_slope_would_desta
     quick = StateModel(TransferFunction([0.1], [1.0, -0.9]))
     slow = StateModel(TransferFunction([1e-6], np.poly([1.0, 0.99, 0.985, 0.98]).tolist()))
     for model, bears in ((quick, True), (slow, False)):
-        gain = preview_gains(model, 1.0, 0.0, 0).state
-        assert tolerates(model, gain, 1.0)
-        assert tolerates(model, gain, 3.0) is bears
+        gains = preview_gains(model, 1.0)
+        assert modulus_margin(model, model, gains) > 0.0
+        assert (modulus_margin(model, model, gains, 3.0) > 0.0) is bears
 
 
 @given(st.lists(st.floats(-1.0, 1.0), min_size=2, max_size=2))
@@ -195,7 +195,8 @@ def test_with_the_true_slope_the_observer_changes_no_pole_of_the_loop(gain: list
     k = np.array(gain)
     radius = np.abs(np.linalg.eigvals(model.a - np.outer(model.b, k))).max()
     assume(abs(radius - 1.0) > 1e-3)
-    assert tolerates(model, k, 1.0) == (radius < 1.0)
+    gains = PreviewGains(k, 0.0, np.zeros(1))
+    assert (modulus_margin(model, model, gains) > 0.0) == (radius < 1.0)
 
 
 @pytest.mark.parametrize('law', ['moving_horizon', 'fixed'])

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
+from math import inf
 from operator import mul
 from typing import NamedTuple
 
@@ -59,14 +59,14 @@ class Plan(NamedTuple):
     x_noise: tuple[Array, ...]
 
 
-@dataclass(frozen=True)
-class TrackingDesign:
+class TrackingDesign(NamedTuple):
     """Gains of one model of G.
 
     plans: ideal trajectories, each weighing u more than the one before, for references with noise.
     feedback: of the deviations from them. schedule: gains (n,), that of full feedback first.
     acquisition: gain (n,) while the backlash is unknown; None where no feedback is better. gentle:
     gain (n,) at rest. push: |x| after HORIZON samples of u = 1. push_ahead: |y| after LOOK_AHEAD.
+    holding: see `_holding`, for each of the schedule.
     """
 
     model: StateModel
@@ -77,33 +77,12 @@ class TrackingDesign:
     gentle: Gain
     push: float
     push_ahead: float
+    holding: list[tuple[Array, Array]]
 
     def variances(self, x_cov: Array) -> Array:
         """Of K x for every gain of the schedule, and of |x| at last."""
         gains = np.array(self.schedule)
         return np.append(((gains @ x_cov) * gains).sum(axis=1), x_cov.trace())
-
-    @cached_property
-    def holding(self) -> tuple[tuple[Array, Array], ...]:
-        """For each gain, (L - 1, n) and (L - 1, L): u that it agrees with after it was held.
-
-        Held for j samples from x - x* = e on, u is what u*(k+j) - K (x - x*) asks for then:
-        (1 + sum_i K A^i B) u = u*(k+j) + sum_i K A^(j-1-i) B u*(k+i) - K A^j e,  i = 0 .. j - 1
-        """
-        n, length = self.model.order, len(self.plans[0].states)
-        rows = powers(self.model.a, np.eye(n), length)
-        held = []
-        for gain in self.schedule:
-            by_state = np.array(gain) @ rows
-            answers = np.append(1.0, by_state @ self.model.b)[:length]
-            # Without SciPy, which would take a controller 22 MB.
-            ago = np.subtract.outer(np.arange(len(answers)), np.arange(length))
-            by_u = np.tril(answers[np.maximum(ago, 0)])[1:]
-            share = by_u.sum(axis=1)
-            count = int(np.cumprod(share > 0.0).sum())  # beyond, it asks for more the more u is
-            by_both = np.column_stack([-by_state[1:], by_u])[:count] / share[:count, None]
-            held.append((by_both[:, :n], by_both[:, n:]))
-        return tuple(held)
 
 
 def design(model: StateModel, weights: Weights, weight_factor: float = 1.0) -> TrackingDesign:
@@ -117,15 +96,16 @@ def design(model: StateModel, weights: Weights, weight_factor: float = 1.0) -> T
         _plan(model, preview_gains(model, more * rho, weights.integral_weight, weights.preview))
         for more in SOFTER)
     feedback = feedback_around(model, weights, weight_factor)
-    softer = [preview_gains(model, max(more, weight_factor) * rho).state for more in SCHEDULE[1:]]
-    schedule = feedback.state.tolist(), *(gain.tolist() for gain in softer)
-    bears = tolerates(model, softer[SOFTEST - 1], wrong_slope)
+    softer = [preview_gains(model, max(more, weight_factor) * rho) for more in SCHEDULE[1:]]
+    schedule = feedback.state.tolist(), *(gains.state.tolist() for gains in softer)
+    bears = modulus_margin(model, model, softer[SOFTEST - 1], wrong_slope) > 0.0
     # With |G|^2 at a frequency as weight of u^2, feedback acts up to about that frequency.
     gentle = preview_gains(model, power_gain(model.transfer_function, rest_bandwidth)).state
     ahead, later = (powers(model.a, model.b, k).sum(axis=0) for k in (LOOK_AHEAD, HORIZON))
     return TrackingDesign(
         model, plans, feedback, schedule, schedule[SOFTEST] if bears else None, gentle.tolist(),
-        float(np.linalg.norm(later)), model.c * abs(float(ahead[0])))
+        float(np.linalg.norm(later)), model.c * abs(float(ahead[0])),
+        [_holding(model, gain, len(plans[0].states)) for gain in schedule])
 
 
 def better_design(
@@ -166,6 +146,22 @@ def dot(a: Sequence[float], b: Sequence[float]) -> float:
     return product
 
 
+def _holding(model: StateModel, gain: Gain, length: int) -> tuple[Array, Array]:
+    """(L - 1, n) and (L - 1, L): u that a gain agrees with after it was held.
+
+    Held for j samples from x - x* = e on, u is what u*(k+j) - K (x - x*) asks for then:
+    (1 + sum_i K A^i B) u = u*(k+j) + sum_i K A^(j-1-i) B u*(k+i) - K A^j e,  i = 0 .. j - 1
+    """
+    by_state = np.array(gain) @ powers(model.a, np.eye(model.order), length)
+    answers = np.append(1.0, by_state @ model.b)[:length]
+    # Without SciPy, which would take a controller 22 MB.
+    ago = np.subtract.outer(np.arange(length), np.arange(length))
+    by_u = np.tril(answers[np.maximum(ago, 0)])[1:]
+    share = by_u.sum(axis=1)
+    count = int(np.cumprod(share > 0.0).sum())  # beyond, it asks for more the more u is
+    return -by_state[1:count + 1] / share[:count, None], by_u[:count] / share[:count, None]
+
+
 def _plan(model: StateModel, gains: PreviewGains) -> Plan:
     n, last = model.order, len(gains.preview) - 1
     length = min(LOOK_AHEAD, last // 3) + 1
@@ -201,63 +197,43 @@ def _plan(model: StateModel, gains: PreviewGains) -> Plan:
                 tuple(x_noise))
 
 
-# --- how far feedback u = -K x_hat - K_q q is from instability, q(k+1) = q(k) - y(k) --------------
-# x_hat comes from an observer of [x; d] as in FixedBacklash that believes `model`, d being a slow
-# disturbance of u.
-
-
-def tolerates(model: StateModel, gain: Array, factor: float) -> bool:
-    """Whether feedback keeps G stable although u acts so many times as strongly as believed."""
-    # The gap itself is left out: it limits what u can do wrong, but not for ever.
-    return all(_is_stable(model, model, gain, 0.0, each, factor) for each in CONFIDENCES)
-
-
-def modulus_margin(plant: StateModel, model: StateModel, gains: PreviewGains) -> float:
-    """min |1 + L| of the open loop L with the worst of the observers; 0 where one is unstable."""
-    if not all(_is_stable(plant, model, gains.state, gains.integral, each) for each in CONFIDENCES):
-        return 0.0
-    return min(_distance(plant, model, gains, each) for each in CONFIDENCES)
-
-
-def _is_stable(
-    plant: StateModel, model: StateModel, gain: Array, integral: float, confidence: float,
-    factor: float = 1.0,
-) -> bool:
-    """Whether the loop with the state [x of the plant; x_hat; d_hat; q] is stable."""
-    observer = _observer(model, confidence)
-    if observer is None:
-        return False
-    believed, drive, seen, correction = observer
-    n = plant.order
-    size = n + len(drive) + 1
-    gains, loop = np.zeros(size), np.zeros((size, size))
-    gains[n:-2], gains[-1] = gain, integral
-    loop[:n, :n] = plant.a
-    loop[:n] -= factor * np.outer(plant.b, gains)
-    # x_hat(k+1) = prediction + correction (y(k+1) - its prediction)
-    loop[n:-1, n:-1] = believed
-    loop[n:-1] -= np.outer(drive, gains)
-    loop[n:-1] += np.outer(correction, plant.c * loop[0] - seen @ loop[n:-1])
-    if integral:
-        loop[-1, 0], loop[-1, -1] = -plant.c, 1.0
-    return bool(np.abs(np.linalg.eigvals(loop)).max() < 1.0)
-
-
-def _distance(
-    plant: StateModel, model: StateModel, gains: PreviewGains, confidence: float,
+def modulus_margin(
+    plant: StateModel, model: StateModel, gains: PreviewGains, factor: float = 1.0,
 ) -> float:
-    """Least |1 + L| of a stable loop, opened at u."""
-    observer = _observer(model, confidence)
-    assert observer is not None
-    believed, drive, seen, correction = observer
-    gain = np.append(gains.state, 0.0)
-    closed = believed - np.outer(drive, gain)
-    closed -= np.outer(correction, seen @ closed)
+    """min |1 + L| of the open loop L of feedback around `model` and a plant; 0 if it is unstable.
+
+    For the worst of observers that do not know that u acts `factor` times as strongly. The gap
+    itself is left out: it limits what u can do wrong, but not for ever.
+    """
+    n, least = plant.order, inf
     z = np.exp(1j * np.geomspace(1e-3, np.pi, 120))
-    at = z[:, None, None]
-    x_hat = np.linalg.solve(at * np.eye(len(gain)) - closed, at * correction[:, None])
-    minus_u = (gain @ x_hat)[:, 0] - gains.integral / (z - 1.0)
-    return float(np.abs(1.0 + plant.transfer_function.response(z) * minus_u).min())
+    at, response = z[:, None, None], plant.transfer_function.response(z)
+    for confidence in CONFIDENCES:
+        observer = _observer(model, confidence)
+        if observer is None:
+            return 0.0
+        believed, drive, seen, correction = observer
+        # The loop with the state [x of the plant; x_hat; d_hat; q].
+        size = n + len(drive) + 1
+        gain, loop = np.zeros(size), np.zeros((size, size))
+        gain[n:-2], gain[-1] = gains.state, gains.integral
+        loop[:n, :n] = plant.a
+        loop[:n] -= factor * np.outer(plant.b, gain)
+        # x_hat(k+1) = prediction + correction (y(k+1) - its prediction)
+        loop[n:-1, n:-1] = believed
+        loop[n:-1] -= np.outer(drive, gain)
+        loop[n:-1] += np.outer(correction, plant.c * loop[0] - seen @ loop[n:-1])
+        if gains.integral:
+            loop[-1, 0], loop[-1, -1] = -plant.c, 1.0
+        if not np.abs(np.linalg.eigvals(loop)).max() < 1.0:
+            return 0.0
+        # Opened at u.
+        closed = believed - np.outer(drive, gain[n:-1])
+        closed -= np.outer(correction, seen @ closed)
+        x_hat = np.linalg.solve(at * np.eye(len(drive)) - closed, at * correction[:, None])
+        minus_u = (gain[n:-1] @ x_hat)[:, 0] - gains.integral / (z - 1.0)
+        least = min(least, float(np.abs(1.0 + factor * response * minus_u).min()))
+    return least
 
 
 @lru_cache(maxsize=16)

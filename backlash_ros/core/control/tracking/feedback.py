@@ -87,7 +87,6 @@ class StateFeedback:
         self._design = design
         self._least = 0.5 * self._y_std * np.array([hypot(*gain) for gain in design.schedule])
         self.noise = DeviationNoise(self._least.tolist())
-        self._holding = design.holding  # made here, before a command waits for it
         # Places in the schedule: of the gain that its noise asks for, and of the one in use.
         self._quiet = self._in_use = 0
 
@@ -209,7 +208,7 @@ class StateFeedback:
         self, deviation: Sequence[float], ahead: Sequence[float], side: Region, turns_in: int,
     ) -> float:
         """The furthest u that v can hold and never be asked to come back from until u* turns."""
-        by_state, by_u = self._holding[self._in_use]
+        by_state, by_u = self._design.holding[self._in_use]
         agreed = side * (by_state @ deviation + by_u @ ahead)[:turns_in]
         return side * float(agreed.min(initial=inf))
 
