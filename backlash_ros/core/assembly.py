@@ -7,12 +7,11 @@ from functools import lru_cache
 
 import numpy as np
 
-from backlash_ros.core.control.controller import AdaptiveController
+from backlash_ros.core.control.controller import DOUBT, AdaptiveController, SerialPlant
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.limits import Limits, check_last_commands
 from backlash_ros.core.control.paper_structure import PolePlacement, Proportional
 from backlash_ros.core.control.protocol import ControlStructure
-from backlash_ros.core.control.serial_plant import DOUBT, SerialPlant
 from backlash_ros.core.control.tracking.design import Weights, better_design, design, power_gain
 from backlash_ros.core.control.tracking.preview import preview_gains
 from backlash_ros.core.control.tracking.tracking import Tracking
