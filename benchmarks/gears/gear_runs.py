@@ -23,7 +23,7 @@ from backlash_ros.core.identification.identification import Identification, iden
 from backlash_ros.core.identification.motion import strokes
 from backlash_ros.core.identification.structure_search import Options
 from backlash_ros.core.parameters import ParameterError, Value
-from backlash_ros.tools.identify.identified_file import as_estimate, identified_parameters
+from backlash_ros.tools.identify.outcome import as_estimate, identified_parameters
 
 Motion = Callable[[float], float]  # of the phase [rad], between -1 and 1
 

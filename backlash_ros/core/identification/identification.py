@@ -142,7 +142,7 @@ def identify(
         whole[part] = samples.y
         samples = replace(samples, v=v, y=whole, last=len(v))
         begin = moved_to(best.structure, best, p0=float(v[0]) + 0.5 * best.gap)
-        best = fitted(samples, best.structure, begin, FIRST_STEPS)
+        best = fitted(samples, best.structure, begin, steps=FIRST_STEPS)
         kept = search.without_outliers(samples, best)
         if kept is not samples:
             samples = kept

@@ -124,7 +124,7 @@ class Samples:
 
 @dataclass(frozen=True)
 class Model:
-    """A structure with the values that fit best, all in scaled units."""
+    """A structure with the values that fit best, in scaled units; less is what leaves less."""
 
     structure: Structure
     problem: Problem
@@ -145,6 +145,9 @@ class Model:
         """Of the residual; inf where they are no number."""
         squares = float(self.left @ self.left)
         return squares if np.isfinite(squares) else inf
+
+    def __lt__(self, other: Model) -> bool:
+        return self.squares < other.squares
 
     def behind(self, best: Model, rows: float) -> float:
         """Twice the log-likelihood by which it explains less, of so many independent readings."""
@@ -175,15 +178,18 @@ class Model:
 
 
 def fitted(
-    samples: Samples, structure: Structure, begin: WindowFit, steps: int = STEPS,
+    samples: Samples, structure: Structure, *begins: WindowFit, steps: int = STEPS,
 ) -> Model:
-    """The best values nearest to some."""
-    problem = samples.problem(structure)
-    # As much noise as there is motion hides nothing from the first step.
-    begin = replace(begin, step=0.0, noise_std=max(begin.noise_std, 1e-12))
-    with suppress(np.linalg.LinAlgError):  # what has no finite posterior stays as it began
-        begin = problem.fitted(begin, steps)
-    return Model(structure, problem, begin)
+    """The best of the values nearest to some."""
+    found = []
+    for begin in begins:
+        problem = samples.problem(structure)
+        # As much noise as there is motion hides nothing from the first step.
+        fit = replace(begin, step=0.0, noise_std=max(begin.noise_std, 1e-12))
+        with suppress(np.linalg.LinAlgError):  # what has no finite posterior stays as it began
+            fit = problem.fitted(fit, steps)
+        found.append(Model(structure, problem, fit))
+    return min(found)
 
 
 def moved_to(
@@ -234,7 +240,7 @@ def first_model(
         theta = np.concatenate([[1.0, offset, gap], structure.xi(b, a[1:])])
         fit = WindowFit(solution[len(solution) - structure.states:], p0, theta, 1.0)
         found.append(Model(structure, problem, fit))
-    return min(found, key=lambda model: model.squares)
+    return min(found)
 
 
 # --- residuals and deviations ---------------------------------------------------------------------

@@ -137,14 +137,13 @@ def searched(v: Array, y: Array, options: Options, delays: Sequence[int]) -> Str
             break
         candidates = [best, candidates[0]]  # the general G may have been a poor one
     rows = effective(best.left)
-    rivals = sorted((0.5 * one.behind(best, rows), one.gap) for one in models
-                    if abs(one.gap - best.gap) > ANOTHER * best.gap)
+    rivals = [(one.gap, 0.5 * one.behind(best, rows)) for one in models
+              if abs(one.gap - best.gap) > ANOTHER * best.gap]
     later = replace(samples, first=cut)
     held_out = HeldOut(cut, later.fitted_y, _predicted(chosen.trained, later), chosen.held_out,
                        chosen.trained.rms)
     return StructureSearch(
-        samples, compared, chosen, best, [(gap, behind) for behind, gap in rivals], held_out,
-        delays, by_model(best.gap, [
+        samples, compared, chosen, best, rivals, held_out, delays, by_model(best.gap, [
             (one.whole.gap, one.criterion - chosen.criterion) for one in compared]))
 
 
@@ -153,11 +152,9 @@ def _with_general(samples: Samples, delays: Sequence[int]) -> list[Model]:
     general = Structure(
         GENERAL_POLES, min(delays), False, GENERAL_POLES + max(delays) - min(delays))
     swing = float(np.ptp(samples.v))
-    begins = sorted((
-        first_model(samples, general, gap, float(samples.v[0]) + 0.5 * gap)
-        for gap in (0.0, 0.05 * swing, 0.2 * swing, 0.5 * swing)), key=lambda one: one.squares)
-    best = min((fitted(samples, general, one.fit, FEW_STEPS) for one in begins[:2]),
-               key=lambda one: one.squares)
+    begins = sorted(first_model(samples, general, gap, float(samples.v[0]) + 0.5 * gap)
+                    for gap in (0.0, 0.05 * swing, 0.2 * swing, 0.5 * swing))
+    best = fitted(samples, general, *(one.fit for one in begins[:2]), steps=FEW_STEPS)
     models = _of_gaps(samples, best)
     # Around another G the search may find another gap.
     if models[0].squares < 0.9 * best.squares and abs(models[0].gap - best.gap) > 0.1 * best.gap:
@@ -178,14 +175,13 @@ def _of_gaps(samples: Samples, like: Model) -> list[Model]:
         if len(begins) <= most and all(abs(gap - other) > ANOTHER * other for other in gaps):
             gaps.append(gap)
             begins.append(problem.step(moved_to(structure, like, gap, p0), held=True))
-    some = sorted((fitted(samples, structure, begin, FIRST_STEPS) for begin in begins),
-                  key=lambda one: one.squares)
+    some = sorted(fitted(samples, structure, begin, steps=FIRST_STEPS) for begin in begins)
     models: list[Model] = []
     for one in some:
         model = one if one.squares > 1.5 * some[0].squares else fitted(samples, structure, one.fit)
         if all(abs(model.gap - other.gap) > apart * other.gap for other in models):
             models.append(model)
-    return sorted(models, key=lambda one: one.squares)
+    return sorted(models)
 
 
 def without_outliers(samples: Samples, found: Model) -> Samples:
@@ -225,14 +221,13 @@ def _compare(
         delays, one = [s.delay for s in alike], alike[0]
         general = replace(
             one, delay=min(delays), taps=one.numerator_taps + max(delays) - min(delays))
-        best = min((first_model(train, general, like.gap, like.fit.p0) for like in candidates),
-                   key=lambda model: model.squares)
-        like = fitted(train, general, best.fit, RACE_STEPS)
+        best = min(first_model(train, general, like.gap, like.fit.p0) for like in candidates)
+        like = fitted(train, general, best.fit, steps=RACE_STEPS)
         for structure in alike:
             taps = like.numerator[structure.delay - general.delay:]
             begin = replace(like.fit, theta=np.concatenate([
                 like.fit.theta[:3], structure.xi(taps, like.a)]), x=np.zeros(1))
-            found = fitted(train, structure, begin, RACE_STEPS)
+            found = fitted(train, structure, begin, steps=RACE_STEPS)
             first[structure] = compared(found, found)
     done: dict[Structure, Compared] = {}
     for structure in sorted(_finalists(_with_criteria(first.values())), key=lambda s: s.order):
@@ -241,8 +236,7 @@ def _compare(
         if smaller is not None:
             begins += [moved_to(structure, smaller.trained, factor=(1.0, -pole))
                        for pole in (0.3, 0.85)]
-        trained = min((fitted(train, structure, begin, FIRST_STEPS) for begin in begins),
-                      key=lambda one: one.squares)
+        trained = fitted(train, structure, *begins, steps=FIRST_STEPS)
         done[structure] = compared(trained, fitted(samples, structure, trained.fit))
     finished = {one.structure: one for one in _with_criteria(done.values())}
     return [finished.get(structure, one) for structure, one in first.items()]
@@ -251,7 +245,7 @@ def _compare(
 def _with_criteria(compared: Iterable[Compared]) -> list[Compared]:
     """The same with their criteria, and no error less than what a simulation rounds."""
     compared = list(compared)
-    best = min((one.whole for one in compared), key=lambda whole: whole.squares)
+    best = min(one.whole for one in compared)
     count, rows = len(best.left), effective(best.left)
     # A step of the recursion A y = ... rounds by |A|_1 |y| eps at most, and 1/A hands that on.
     answer = lfilter([1.0], best.denominator, np.eye(1, len(best.problem.v))[0])
@@ -343,10 +337,9 @@ def later(early: StructureSearch, options: Options) -> StructureSearch:
     while scan[-1].structure.delay < min(latest, alike[-1].structure.delay + worse_for):
         before = scan[-1]
         structure = replace(best.structure, delay=before.structure.delay + 1)
-        begins = [moved_to(structure, before), first_model(
-            samples, structure, before.gap, before.fit.p0, (0.6,)).fit]
-        scan.append(min((fitted(samples, structure, begin, FIRST_STEPS) for begin in begins),
-                        key=lambda one: one.squares))
+        anew = first_model(samples, structure, before.gap, before.fit.p0, (0.6,))
+        scan.append(fitted(samples, structure, moved_to(structure, before), anew.fit,
+                           steps=FIRST_STEPS))
         most = min(one.squares for one in scan) * exp(2.0 * alike_by / rows)
         alike = [one for one in scan if one.squares <= most]
     first, last = (alike[k].structure.delay for k in (0, -1))

@@ -8,18 +8,21 @@ from collections.abc import Mapping
 from dataclasses import replace
 from html import escape
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from backlash_ros.atomic_file import write_atomically
+from backlash_ros.core.assembly import build_controller, first_guess
+from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.estimates_file import save_estimate
 from backlash_ros.core.identification.actuator import with_actuator
-from backlash_ros.core.identification.identification import Identification, identify
+from backlash_ros.core.identification.identification import Details, Identification, identify
 from backlash_ros.core.identification.structure_search import Options
-from backlash_ros.core.parameters import ParameterError, Value
+from backlash_ros.core.parameters import BRINGUP, BY_NAME, PLANT, ParameterError, Parameters, Value
 from backlash_ros.core.records.record import Record
 from backlash_ros.tools.cli import BrokenOffError, format_table
-from backlash_ros.tools.identify import identified_file as file
+from backlash_ros.tools.config import ANY, config_text
 from backlash_ros.tools.page import facts, page, table
 from backlash_ros.tools.records.columns import COMMAND, ROLES
 from backlash_ros.tools.runs.files import result_directory, write_summary, write_table
@@ -48,13 +51,13 @@ def write_outcome(
     if found.usable:
         estimates.unlink(missing_ok=True)  # of a record before, if any
         try:
-            parameters = file.identified_parameters(found, given, estimates)
-            text = file.commented_yaml(parameters, found, record.source, options.axis)
+            parameters = identified_parameters(found, given, estimates)
+            text = commented_yaml(parameters, found, record.source, options.axis)
             write_atomically(out / YAML, text)
-            save_estimate(estimates, file.as_estimate(found, parameters), parameters)
+            save_estimate(estimates, as_estimate(found, parameters), parameters)
         except ParameterError as error:
             found = replace(found, refused=f'the controller does not take it: {error}')
-    write_summary({**file.numbers(found), 'timing': record.timing, 'notes': record.notes},
+    write_summary({**numbers(found), 'timing': record.timing, 'notes': record.notes},
                   out / 'identified.json')
     write_record(replace(record, v=found.v), out / 'record.csv')
     # A Ctrl-C waits while Matplotlib is loaded, which would take it for a part that is missing.
@@ -113,3 +116,173 @@ def _facts(found: Identification, record: Record) -> list[tuple[str, str]]:
                      f'{actuator.lag.order} poles, gain {actuator.gain:.6g}; wind-up {right:.4g} '
                      f'on the right, {left:.4g} on the left'))
     return told
+
+
+def identified_parameters(
+    found: Identification, given: Mapping[str, Value], estimates: Path | None = None,
+) -> Parameters:
+    """The complete set: what was found, in what the user has given, and defaults for the rest.
+
+    estimates: file of what the controller is to begin with. Raises ParameterError where the
+    controller does not take it.
+    """
+    # Parameters of the file that the user gave which do not go on: of the simulation, of one run.
+    not_taken_over = (
+        'truth', 'backlash', 'output_noise_std', 'output_quantum', 'input_disturbance', 'estimates',
+        'bag', 'lockstep', 'wait_for_subscribers', 'wait_for_publishers', 'axes')
+    wider = 3.0  # bounds of the estimates, in times of what was found
+    assert found.details is not None
+    reach = max(abs(found.c_r), abs(found.c_l)) + found.std['c_r']
+    scale = _short(max(wider * max(found.gap, reach), 1e-9))
+    c_r, c_l, g = _short(found.c_r, 6), _short(found.c_l, 6), found.model
+    lag = found.actuator and found.actuator.lag
+    right, left = found.actuator.wind_up if found.actuator else (0.0, 0.0)
+    # Digits that the swing bears, wherever 0 of v is.
+    digits = 3 - int(np.floor(np.log10(np.ptp(found.v))))
+    values: dict[str, Any] = {
+        # v as far and as fast as it went in the record, and no further, where no limit is given.
+        'control.min': round(float(found.v.min()), digits),
+        'control.max': round(float(found.v.max()), digits),
+        'control.rate_max': _short(np.abs(np.diff(found.v)).max() / found.sample_period, 4),
+        **_weights(found, found.details),
+        **({'estimator.use_applied_control': 'true'} if lag else {}),
+        **(_reference(found, found.details)
+           if not {'waveform', 'amplitude', 'frequency', 'bias', 'file'} & set(given) else {}),
+        **{name: value for name, value in given.items() if not name.startswith(not_taken_over)},
+        'sample_period': found.sample_period,
+        'plant.numerator': g.numerator, 'plant.denominator': g.denominator,
+        'plant.uncertainty': g.uncertainty, 'control.delay_samples': g.delay,
+        # None where v is the command: whatever the given file has of it is outdated.
+        'actuator.numerator': tuple(lag.numerator.tolist()) if lag else (),
+        'actuator.denominator': tuple(lag.denominator.tolist()) if lag else (),
+        'actuator.wind_up': (_short(right, 6), _short(left, 6)),
+        'estimator.initial.m': found.m,
+        'estimator.initial.c_r': c_r, 'estimator.initial.c_l': c_l,
+        'estimator.bounds.m': (_short(found.m / wider), _short(found.m * wider)),
+        'estimator.bounds.c_r': (-scale, scale), 'estimator.bounds.c_l': (-scale, scale),
+        'estimator.output_noise_std': _short(max(g.noise_std, 1e-12)),
+        # The simulated plant is the one that was found, so that the file can be tried out.
+        'backlash.m': found.m, 'backlash.c_r': c_r, 'backlash.c_l': c_l,
+        'output_quantum': _short(g.quantum, 6),
+        'output_noise_std': 0.0 if g.quantum else _short(g.noise_std),
+        **({'estimates.file': str(estimates), 'estimates.load': True} if estimates else {}),
+    }
+    if 'structure' not in given:
+        # y follows y_m where gains for that can be designed, else u_d = y_m.
+        try:
+            return _accepted({**values, 'structure': 'tracking'})
+        except (ValueError, ArithmeticError, np.linalg.LinAlgError):
+            values.update({'structure': 'proportional', 'proportional.f': 0.0})
+    return _accepted(values)
+
+
+def _accepted(values: Mapping[str, Any]) -> Parameters:
+    parameters = Parameters(values)
+    # estimates.file is yet to be written, perhaps over that of another record.
+    build_controller(parameters, first_guess(parameters))
+    return parameters
+
+
+def _short(value: float, digits: int = 3) -> float:
+    return float(f'{value:.{digits}g}')
+
+
+def _reference(found: Identification, details: Details) -> dict[str, Value]:
+    """A reference that the actuator can follow, and that shows the gap."""
+    y = found.y[np.isfinite(found.y)]
+    middle = 0.0 if found.model.integrator else 0.5 * float(np.percentile(y, [5, 95]).sum())
+    gain = float(np.abs(details.response.at(found.model.frequencies[:1]))[0])
+    reach = 0.5 * (float(np.ptp(found.v)) - found.gap)
+    share = max(0.4, min(0.75 * found.gap / reach, 0.8))
+    return {
+        'waveform': 'sine', 'amplitude': _short(share * gain * reach), 'bias': _short(middle),
+        'frequency': _short(found.model.frequencies[0] / found.sample_period)}
+
+
+def _weights(found: Identification, details: Details) -> dict[str, Value]:
+    """The usual weight of u, at a frequency where G is known and v still moves y."""
+    # To the frequency [rad/sample] at which tracking.input_weight takes |G|.
+    w = np.linspace(found.model.frequencies[0], np.pi / 10.0, 200)
+    gain = np.abs(details.response.at(w))
+    if found.actuator is not None:
+        gain = gain * np.abs(found.actuator.lag.response(np.exp(1j * w)))
+    # Beyond a tenth of the gain at the lowest frequency motion of y takes too much of v.
+    beyond = np.flatnonzero((w > details.response.known_up_to) | (gain < 0.1 * gain[0]))
+    if not len(beyond):
+        return {}
+    last, usual = max(int(beyond[0]) - 1, 0), Parameters().tracking
+    return {
+        'tracking.input_weight': _short(usual.input_weight * max(gain[last] / gain[-1], 1.0)**2, 2),
+        # Nearly a period of that motion.
+        'tracking.preview': min(max(round(6.0 / w[last]), usual.preview), 600)}
+
+
+def as_estimate(found: Identification, parameters: Parameters) -> Estimate:
+    """What a controller may begin with, as if it had learned it itself."""
+    # A deviation of 0 would say that a constant was given.
+    least = 1e-6 * max(found.gap, abs(found.c_r), abs(found.c_l))
+    initial = parameters.estimator.initial
+    return Estimate(
+        found.m, initial.c_r, initial.c_l, parameters.proportional.f,
+        max(found.std['m'], 1e-6 * found.m), max(found.std['c_r'], least),
+        max(found.std['c_l'], least))
+
+
+def numbers(found: Identification) -> dict[str, Any]:
+    """Content of identified.json."""
+    held_out, actuator = found.details and found.details.held_out, found.actuator
+    g, verdict = found.model, found.verdict
+    of_all = ('usable', 'reasons', 'remarks', 'm', 'gap', 'c_r', 'c_l', 'sample_period')
+    of_model = ('numerator', 'denominator', 'integrator', 'uncertainty', 'outliers')
+    return {
+        **{name: getattr(found, name) for name in of_all},
+        **{name: getattr(g, name) for name in of_model},
+        'known': verdict and {name: getattr(verdict, name)._asdict()
+                              for name in ('backlash', 'gain', 'model')},
+        'offset': 0.5 * (found.c_r + found.c_l),
+        'std': dict(found.std) or dict.fromkeys(('m', 'gap', 'c_r', 'c_l')),
+        'delay_samples': g.delay, 'equally_good_delays': g.delays,
+        'output_noise_std': g.noise_std, 'output_quantum': g.quantum,
+        'response': {'frequency_hz': found.hertz.tolist(),
+                     'relative_std': g.response_std.tolist()},
+        'held_out': held_out and {'rms': held_out.rms, 'rms_of_fit': held_out.trained},
+        'actuator': actuator and {
+            'numerator': actuator.lag.numerator.tolist(),
+            'denominator': actuator.lag.denominator.tolist(), 'wind_up': actuator.wind_up},
+        'samples': len(found.y), 'lost_samples': int(np.isnan(found.y).sum()),
+    }
+
+
+def commented_yaml(
+    parameters: Parameters, found: Identification, source: str, axis: str = '',
+) -> str:
+    """A parameter file that says of each value what it is and, where it was found, how surely."""
+    band, std = found.hertz, found.std
+    comments = {
+        'plant.numerator': f'G to ± {100.0 * found.model.response_std.max():.2g} % from '
+                           f'{band[0]:.2g} to {band[-1]:.2g} Hz; its gain is that for m = '
+                           f'{found.m:g}, ± {100.0 * std["m"] / found.m:.2g} %',
+        'estimator.initial.m': 'as told with --slope, 1 where it was not: G has the gain for it',
+        'estimator.initial.c_r': f'± {std["c_r"]:.2g} [v]',
+        'estimator.initial.c_l': f'± {std["c_l"]:.2g} [v]',
+        'estimator.output_noise_std': 'deviation of y from the simulation [y]',
+    }
+    lines = [
+        f'# Identified from {source}: {len(found.y)} samples of {found.sample_period:g} s.',
+        f'# {"; ".join(found.remarks)}.' if found.remarks else '# Nothing spoke against it.',
+        '# Values with ± were found, the others are as they were given, or defaults.']
+    path: list[str] = []
+    for line in config_text(parameters).splitlines():
+        path[(len(line) - len(line.lstrip())) // 2:] = [line.split(':')[0].strip()]
+        entry = BY_NAME.get('.'.join(path[2:]))
+        if entry is not None:
+            simulated = 'the simulated plant: ' if entry.used_by == (PLANT,) else ''
+            unit = f' [{entry.unit}]' if entry.unit else ''
+            comment = comments.get(entry.name) or f'{simulated}{entry.description}{unit}'
+            line = f'{line.ljust(52)}  # {comment}'
+        lines.append(line)
+    text = '\n'.join([*lines, ''])
+    if axis:
+        text = text.replace(f'\n/{ANY}:', f'\n/{axis}/{ANY}:')
+        text += f"/{BRINGUP}:\n  ros__parameters:\n    axes: ['{axis}']\n"
+    return text

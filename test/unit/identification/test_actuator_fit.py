@@ -14,8 +14,7 @@ from backlash_ros.core.identification.identification import Identification, iden
 from backlash_ros.core.identification.motion import strokes
 from backlash_ros.core.identification.structure_search import Options
 from backlash_ros.core.records.record import Record
-from backlash_ros.tools.identify.identified_file import commented_yaml, identified_parameters
-from backlash_ros.tools.identify.outcome import write_record
+from backlash_ros.tools.identify.outcome import commented_yaml, identified_parameters, write_record
 from backlash_ros.tools.records.messages import from_messages
 from backlash_ros.tools.records.reading import read_record
 

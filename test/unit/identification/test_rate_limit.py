@@ -8,7 +8,7 @@ from backlash_ros.core.identification.identification import identify
 from backlash_ros.core.identification.not_play import rate_limit
 from backlash_ros.core.identification.structure_search import Options
 from backlash_ros.core.plant.backlash import play
-from backlash_ros.tools.identify.identified_file import identified_parameters
+from backlash_ros.tools.identify.outcome import identified_parameters
 
 PERIOD_S, GAP = 0.02, 0.3
 
