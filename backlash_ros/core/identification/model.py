@@ -16,7 +16,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
 from math import inf, log, nan, sqrt
 from typing import NamedTuple
 
@@ -24,7 +23,7 @@ import numpy as np
 from numpy.polynomial.polynomial import polyval
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.fit import STEPS, Problem, Run
+from backlash_ros.core.estimation.fit import STEPS, Problem
 from backlash_ros.core.estimation.plant_family import delayed, padded, state_columns
 from backlash_ros.core.estimation.posterior import Prior, WindowFit
 from backlash_ros.core.plant.backlash import play
@@ -38,41 +37,26 @@ GRID: Array = np.pi * (np.arange(40) + 0.5) / 40  # frequencies [rad/sample]
 SILENT = 0.1  # relative deviation, or difference, of G beyond which the record is silent
 
 
-@dataclass(frozen=True)
+@dataclass(unsafe_hash=True)
 class Structure:
     """A family of plants: number of poles, of which one may be an integrator; samples of v before
-    it acts, less one; coefficients of B, where 0 as many as poles, one of G that is a gain."""
+    it acts, less one; coefficients of B, where 0 as many as poles, one of G that is a gain.
+
+    states: numbers of the state before a record. unknowns: numbers that are fitted, with the gap,
+    the start, the offset and the state. leaks: all of count have priors of their own.
+    """
 
     order: int
     delay: int
     integrator: bool
     taps: int = 0
 
-    @property
-    def free_poles(self) -> int:
-        return self.order - self.integrator
-
-    @property
-    def numerator_taps(self) -> int:
-        return self.taps or max(self.order, 1)
-
-    @property
-    def states(self) -> int:
-        """Numbers of the state before a record."""
-        return max(self.order, self.numerator_taps - 1)
-
-    @property
-    def unknowns(self) -> int:
-        """Numbers that are fitted, with the gap, the start, the offset and the state."""
-        return self.count + self.states + 3
-
-    @property
-    def count(self) -> int:
-        return self.numerator_taps + self.free_poles
-
-    @property
-    def leaks(self) -> int:
-        return self.count  # all have priors of their own
+    def __post_init__(self) -> None:
+        self.free_poles = self.order - self.integrator
+        self.numerator_taps = self.taps or max(self.order, 1)
+        self.states = max(self.order, self.numerator_taps - 1)
+        self.count = self.leaks = self.numerator_taps + self.free_poles
+        self.unknowns = self.count + self.states + 3
 
     def at(self, xi: list[float]) -> tuple[list[float], list[float]]:
         """B and A of one length; no numbers where a pole lies outside of the unit circle."""
@@ -122,29 +106,30 @@ class Samples:
         return Problem(structure, self.v[begin:begin + len(y)], y, 1e-12, prior, step=self.step)
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class Model:
-    """A structure with the values that fit best, in scaled units; less is what leaves less."""
+    """A structure with the values that fit best, in scaled units; less is what leaves less.
+
+    numerator: B. denominator: A, with the integrator; a: its free coefficients behind the leading
+    1. run: y, and the play output as it acts on it, at every sample. left: the residual where y is
+    known (R,), its squares, inf where they are no number, and rms.
+    """
 
     structure: Structure
     problem: Problem
     fit: WindowFit
 
-    @cached_property
-    def run(self) -> Run:
-        """y, and the play output p as it acts on it, at every sample."""
-        return self.problem.at(self.fit)
-
-    @cached_property
-    def left(self) -> Array:
-        """The residual where y is known (R,)."""
-        return np.asarray(self.run.error[self.problem.known])
-
-    @property
-    def squares(self) -> float:
-        """Of the residual; inf where they are no number."""
+    def __post_init__(self) -> None:
+        taps, self.gap = self.structure.numerator_taps, self.fit.gap
+        b, a = self.structure.at(self.fit.xi)
+        self.numerator = np.array(b[:taps])
+        self.denominator = np.array(a[:self.structure.order + 1])
+        self.a: Array = VAGUE * self.fit.theta[3 + taps:]
+        self.run = self.problem.at(self.fit)
+        self.left: Array = self.run.error[self.problem.known]
         squares = float(self.left @ self.left)
-        return squares if np.isfinite(squares) else inf
+        self.squares = squares if np.isfinite(squares) else inf
+        self.rms = sqrt(self.squares / max(len(self.left), 1))
 
     def __lt__(self, other: Model) -> bool:
         return self.squares < other.squares
@@ -152,29 +137,6 @@ class Model:
     def behind(self, best: Model, rows: float) -> float:
         """Twice the log-likelihood by which it explains less, of so many independent readings."""
         return rows * log(max(self.squares, TINY) / max(best.squares, TINY))
-
-    @property
-    def rms(self) -> float:
-        return sqrt(self.squares / max(len(self.left), 1))
-
-    @property
-    def gap(self) -> float:
-        return self.fit.gap
-
-    @property
-    def numerator(self) -> Array:
-        """B."""
-        return np.array(self.structure.at(self.fit.xi)[0][:self.structure.numerator_taps])
-
-    @property
-    def a(self) -> Array:
-        """Free coefficients of A behind the leading 1."""
-        return np.asarray(VAGUE * self.fit.theta[3 + self.structure.numerator_taps:])
-
-    @property
-    def denominator(self) -> Array:
-        """A, with the integrator."""
-        return np.array(self.structure.at(self.fit.xi)[1][:self.structure.order + 1])
 
 
 def fitted(

@@ -136,10 +136,11 @@ class LinearFamily:
             for part in (slice(0, half), slice(half, None)))
 
 
-@dataclass(frozen=True)
+@dataclass
 class Observed:
     """A record and its fit, N samples each. y: nan where lost. p: play output [v], as it acts on y.
-    noise: standard deviation of white noise and rounding of y. gap: that of p."""
+    noise: standard deviation of white noise and rounding of y. gap: that of p. unexplained: whether
+    the residual is more than noise. family: some of the record, to compare nonlinearities by."""
 
     v: Array
     y: Array
@@ -148,28 +149,13 @@ class Observed:
     noise: float
     gap: float
 
-    @property
-    def residual(self) -> Array:
-        return np.asarray(self.y - self.simulated)
-
-    @property
-    def rms(self) -> float:
-        return float(np.sqrt(np.nanmean(self.residual**2)))
-
-    @property
-    def swing(self) -> float:
-        """Of y."""
-        return float(np.nanmax(self.y) - np.nanmin(self.y))
-
-    @property
-    def unexplained(self) -> bool:
-        """Whether the residual is more than noise."""
-        return self.rms > max(1.5 * self.noise, 1e-3 * self.swing) and self.family.enough
-
-    @cached_property
-    def family(self) -> LinearFamily:
-        """To compare nonlinearities by, over some of the record."""
-        return LinearFamily(self.v[:4000], self.y[:4000])
+    def __post_init__(self) -> None:
+        self.residual: Array = self.y - self.simulated
+        self.rms = float(np.sqrt(np.nanmean(self.residual**2)))
+        self.swing = float(np.nanmax(self.y) - np.nanmin(self.y))
+        self.family = LinearFamily(self.v[:4000], self.y[:4000])
+        self.unexplained = self.family.enough and \
+            self.rms > max(1.5 * self.noise, 1e-3 * self.swing)
 
     @cached_property
     def one_play(self) -> Candidate:
