@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import ctypes
 import gc
@@ -12,7 +11,7 @@ import signal
 import struct
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from math import isfinite
 from typing import Any
 
@@ -21,7 +20,7 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.exceptions import NameValidationException
 from rclpy.executors import ExternalShutdownException
-from rclpy.logging import LoggingSeverity, get_logger_level, set_logger_level
+from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
@@ -29,7 +28,7 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from rclpy.utilities import remove_ros_args
 
-from backlash_ros.core.parameters import BY_NAME, UNTOLD, ParameterError, as_yaml
+from backlash_ros.core.parameters import UNTOLD, ParameterError
 from backlash_ros.middleware import prefer_loopback
 from backlash_ros.nodes.runtime.executor import Polled, PromptExecutor
 from backlash_ros.nodes.runtime.parameters import ParameterNode, complaints
@@ -149,7 +148,12 @@ def run(
     try:
         try:
             _initialise(arguments)
-            _refuse_plain_arguments(executable, make_node, arguments)
+            OptionParser(
+                executable, ': parameters are given as --ros-args -p NAME:=VALUE or --params-file '
+                'FILE', usage=f'{executable} [--ros-args -p NAME:=VALUE --params-file FILE ...]',
+                description=sys.modules[make_node.__module__].__doc__,
+                epilog='Parameters and what they mean: ros2 param list, ros2 param describe.',
+            ).parse_args(remove_ros_args(arguments))
             node = make_node()
         except (ParameterError, NameValidationException) as error:
             print(f'{executable}: {" ".join(str(error).split())}', file=sys.stderr)
@@ -221,25 +225,4 @@ def _initialise(arguments: list[str]) -> None:
             reason += ': write all numbers of a list with a decimal point'
         raise ParameterError('ROS', UNTOLD, f'cannot begin: {reason}') from None
     finally:
-        if get_logger_level('rcl') == LoggingSeverity.FATAL:
-            set_logger_level('rcl', LoggingSeverity.UNSET)
-
-
-def _refuse_plain_arguments(
-    executable: str, make_node: Callable[[], ProcessNode], arguments: Sequence[str],
-) -> None:
-    """Refuse what is no argument of ROS; print help where asked for."""
-    about = [
-        f'{"* " if p.change == "live" else "  "}{p.name}: {as_yaml(p.default)}\n      '
-        + p.description + (f' [{p.unit}]' if p.unit else '')
-        + (f' (one of {", ".join(p.choices)})' if p.choices else '')
-        for p in BY_NAME.values() if executable in p.used_by
-    ]
-    OptionParser(
-        executable, ': parameters are given as --ros-args -p NAME:=VALUE or --params-file FILE',
-        usage=f'{executable} [--ros-args -p NAME:=VALUE --params-file FILE ...]',
-        description=sys.modules[make_node.__module__].__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter, epilog='\n'.join(
-            ['parameters, with their defaults (* may change in a running node):', *about]
-        ),
-    ).parse_args(remove_ros_args(arguments))
+        set_logger_level('rcl', LoggingSeverity.UNSET)
