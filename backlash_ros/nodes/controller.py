@@ -24,6 +24,7 @@ from backlash_ros.core import assembly
 from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.jobs import Executor, WorkerExecutor
 from backlash_ros.core.loop import sample_counter
+from backlash_ros.core.loop.command_history import KEPT_COMMANDS
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.diagnosis import Neighbours
 from backlash_ros.core.loop.joint_loops import JointLoops
@@ -71,7 +72,7 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
         self._io = DriverIo(self, p)
         if not p.lockstep:
             # The first command begins with what the driver reports, even if it is not learned from.
-            self._io.listen_to_reports(self._on_report)
+            self._io.listen_to(self._io.topics.applied, self._on_report, KEPT_COMMANDS)
         # Whoever waits for the others begins with them; who does not may have been restarted.
         self._counter = SampleCounter(
             p.sample_period, from_zero=not p.lockstep and p.wait_for_subscribers > 0
@@ -82,12 +83,13 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
         self._driver: Subscription | None = None  # plant_output, once it may begin
         self._ending: Timer | None = None  # sends the commands of on_timeout
         to = self._io.topics
-        self._rivals = RivalWatch(self, to.control, self._io.advertise, self._mind_rivals)
+        self._rivals = RivalWatch(self, self._io, self._mind_rivals)
         self._steps = StepPublisher(self, p.joint_names)
         # A stalled controller goes on with the newest values; in lockstep none may be skipped.
         # Woken by each y_m, the process would take half as much time again.
-        self._io.listen_to_references(
-            self._on_reference, KEPT_QOS if p.lockstep else 1, polled=not p.lockstep
+        self._io.listen_to(
+            to.reference, lambda y_m, *_: self._on_reference(y_m), KEPT_QOS if p.lockstep else 1,
+            polled=not p.lockstep,
         )
         self.joints = [Joint(self, name, p.of_joint(name), self._io) for name in p.joint_names]
         offer_services(self, self.joints)
@@ -257,10 +259,10 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
             self._waiting[1].append(self.loops.by_name[''].heard.y_m)
             self._answer_waiting()
 
-    def _on_report(self, applied: Mapping[str, float], stamp_ns: int) -> None:
+    def _on_report(self, applied: Mapping[str, float], info: dict[str, Any], _: object) -> None:
         if self.loops is not None:
             for joint, v in applied.items():
-                self.loops.by_name[joint].take_applied(v, stamp_ns)
+                self.loops.by_name[joint].take_applied(v, self._io.stamp_ns(info))
 
     def _on_clock(self, message: Clock) -> None:
         self._waiting[0].append(Time.from_msg(message.clock).nanoseconds)
@@ -325,21 +327,20 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
         self._mind_rivals()
 
     def _mind_rivals(self) -> None:
-        stand_down = self.settings.on_rival == 'stand_down' \
+        to, stand_down = self._io.topics, self.settings.on_rival == 'stand_down' \
             and any(rival.was_first for rival in self._rivals.found)
         changing = [loop for loop in self.configured if loop.standing_down != stand_down]
         if changing and stand_down:
             for loop in changing:
                 loop.stand_down()
-            self._rivals.commands = self._io.listen_to_commands(self._hear_rival)
+            self._io.listen_to(to.control, self._hear_rival, 1, polled=False)
         elif changing:
-            assert self._rivals.commands is not None
-            self.destroy_subscription(self._rivals.commands)
+            self.destroy_subscription(self._io.heard.pop(to.control))
             for loop in changing:
                 loop.resume()
         self._diagnose()
 
-    def _hear_rival(self, commands: Mapping[str, float]) -> None:
+    def _hear_rival(self, commands: Mapping[str, float], *_: object) -> None:
         for joint in self.joints:
             if joint.loop is not None and joint.name in commands:
                 joint.loop.hear_other(commands[joint.name])

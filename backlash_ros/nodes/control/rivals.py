@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from backlash_ros import topics
 from backlash_ros.core.loop.diagnosis import UNNAMED
+from backlash_ros.nodes.runtime.driver_io import DriverIo
 from backlash_ros.nodes.runtime.executor import serve_polled
 from backlash_ros.nodes.runtime.messages import SILENT_S, arrival_ns
 from backlash_ros.nodes.runtime.process import ProcessNode
@@ -105,15 +105,12 @@ class RivalWatch:
     awaited: controllers of this machine that were there at activation and are not found yet.
     """
 
-    def __init__(
-        self, node: ProcessNode, topic: str, advertise: Callable[[], Publisher],
-        changed: Callable[[], None],
-    ) -> None:
-        self.topic = node.resolve_topic_name(topic)
+    def __init__(self, node: ProcessNode, io: DriverIo, changed: Callable[[], None]) -> None:
+        self.topic = node.resolve_topic_name(io.topics.control)
         self.found: tuple[Rival, ...] = ()
         self.awaited: frozenset[str] = frozenset()
         self._node, self._changed = node, changed
-        own = identity_made_by(node, self.topic, advertise)
+        own = identity_made_by(node, self.topic, io.advertise)
         # What discovery mostly takes: a publisher that is found so soon after the node was made was
         # there before it.
         self._rivals = Rivals(own, node.begun_at + 0.7)
@@ -123,7 +120,6 @@ class RivalWatch:
         self._diagnostics = node.listen(
             DiagnosticArray, topics.DIAGNOSTICS, self._hear, 100, polled=True
         )
-        self.commands: Subscription | None = None  # of who is in charge, if it is another one
         node.every(0.2, self.look)
 
     @property

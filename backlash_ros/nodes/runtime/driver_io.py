@@ -16,7 +16,6 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray
 
 from backlash_ros import topics
-from backlash_ros.core.loop.command_history import KEPT_COMMANDS
 from backlash_ros.core.loop.sample_counter import Output, Timing
 from backlash_ros.core.parameters import ParameterError, Parameters
 from backlash_ros.nodes.runtime.executor import serve_polled
@@ -82,7 +81,7 @@ class DriverIo:
 
     The only joint of a controller without `joints` is nameless; io.joint is its name in messages.
     skipped: messages in a row without a joint. seen: the joints of the newest of these.
-    simulated_time: whether stamps are those of /clock.
+    simulated_time: whether stamps are those of /clock. heard: subscriptions by topic.
     """
 
     publisher: Publisher
@@ -97,7 +96,7 @@ class DriverIo:
         self._repeats_stamps = False  # since then the time of sending counts
         self._newest: dict[str, float] = {}  # v by joint
         self._referred = JointMessage()  # the newest message of references
-        self._heard: dict[str, Subscription] = {}  # polled ones, by topic
+        self.heard: dict[str, Subscription] = {}
 
     @property
     def is_simulated(self) -> bool:
@@ -122,9 +121,10 @@ class DriverIo:
         self, hear: Callable[[Mapping[str, Output]], None], depth: int, polled: bool = False,
     ) -> Subscription:
         """Call hear with every y. polled: when serve_polled is called."""
-        def hear_outputs(message: float | JointMessage, info: dict[str, Any]) -> None:
-            values, stamp_ns, number = \
-                self.values(message), 0, info['publication_sequence_number']
+        def hear_output(
+            values: dict[str, float], info: dict[str, Any], message: float | JointMessage,
+        ) -> None:
+            stamp_ns, number = 0, info['publication_sequence_number']
             of_joints = isinstance(message, JointMessage)
             if isinstance(message, JointMessage):
                 if len(values) < len(self.skipped):
@@ -144,60 +144,42 @@ class DriverIo:
                      info['received_timestamp'], number, not of_joints)
             hear({joint: Output(y, *known) for joint, y in values.items()})
 
-        return self._listen(self.topics.output, hear_outputs, output_qos(self._p, depth), polled)
+        return self.listen_to(self.topics.output, hear_output, output_qos(self._p, depth), polled)
 
-    def listen_to_references(
-        self, hear: Callable[[Mapping[str, float]], None], qos: QoSProfile | int, polled: bool,
-    ) -> None:
-        """Call hear with every y_m. polled: when serve_waiting is called."""
-        def hear_references(message: float | JointMessage, info: dict[str, Any]) -> None:
-            if isinstance(message, JointMessage):
-                self._referred = message
-            hear(self.values(message))
-
-        topic = self.topics.reference
-        self._heard['references'] = self._listen(topic, hear_references, qos, polled)
-
-    def listen_to_reports(self, hear: Callable[[Mapping[str, float], int], None]) -> None:
-        """Have serve_waiting call hear with each v the driver has applied, and its stamp [ns]."""
-        self._heard['reports'] = self._listen(
-            self.topics.applied,
-            lambda message, info: hear(self.values(message), self.stamp_ns(info)), KEPT_COMMANDS,
-        )
-
-    def listen_to_commands(self, hear: Callable[[Mapping[str, float]], None]) -> Subscription:
-        """Call hear with every v that anybody sends to the driver."""
-        return self._listen(
-            self.topics.control, lambda message, info: hear(self.values(message)), 1, polled=False
-        )
-
-    def _listen(
-        self, topic: str, hear: Callable[[Any, dict[str, Any]], None], qos: QoSProfile | int,
-        polled: bool = True,
+    def listen_to(
+        self, topic: str, hear: Callable[[dict[str, float], dict[str, Any], Any], None],
+        qos: QoSProfile | int, polled: bool = True,
     ) -> Subscription:
+        """Call hear with values by joint, info, and content. polled: in serve_waiting."""
         kind = self.topics.types[topic]
         readers: dict[type[Any], Callable[[bytes], Any]] = {
             Float64: number_of, JointState: JointReader().read,
             Float64MultiArray: lambda content: deserialize_message(content, Float64MultiArray).data,
         }
-        read = readers[kind]
-        return self._node.listen(
-            kind, topic, lambda content, info: hear(read(content), info), qos, True, polled
-        )
+        read, refers = readers[kind], kind is JointState and topic == self.topics.reference
+
+        def hear_content(content: bytes, info: dict[str, Any]) -> None:
+            message = read(content)
+            if refers:
+                self._referred = message
+            hear(self.values(message), info, message)
+
+        self.heard[topic] = self._node.listen(kind, topic, hear_content, qos, True, polled)
+        return self.heard[topic]
 
     @property
     def reference_qos(self) -> QoSProfile:
-        return self._heard['references'].qos_profile
+        return self.heard[self.topics.reference].qos_profile
 
     @property
     def has_reports(self) -> bool:
-        reports = self._heard.get('reports')
+        reports = self.heard.get(self.topics.applied)
         return reports is not None and reports.get_publisher_count() > 0
 
     def serve_waiting(self) -> None:
         """Hear the references and reports that have come; not in lockstep, where nothing waits."""
-        for subscription in self._heard.values():
-            serve_polled(subscription)
+        for topic in (self.topics.reference, self.topics.applied):
+            serve_polled(self.heard[topic])
 
     def values(self, message: float | Sequence[float] | JointMessage) -> dict[str, float]:
         """What a message says about the joints of this node, by their names."""
