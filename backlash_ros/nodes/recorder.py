@@ -24,6 +24,7 @@ from std_msgs.msg import Float64MultiArray
 from backlash_ros import topics
 from backlash_ros.bags import REPAIR_COMMAND, Bag, RecordingError, repair_command
 from backlash_ros.core.loop.diagnosis import Finding, Level
+from backlash_ros.core.loop.sample_counter import UNNUMBERED
 from backlash_ros.core.parameters import RECORDER
 from backlash_ros.nodes.runtime import messages
 from backlash_ros.nodes.runtime.driver_io import driver_topics, output_qos
@@ -41,6 +42,8 @@ class RecordedTopic:
     newest: bytes = b''  # serialised
     received: int = 0
     recorded: int = 0
+    missed: int = 0
+    sequence: int = UNNUMBERED  # of the newest message
 
     @property
     def name(self) -> str:
@@ -108,6 +111,16 @@ class RecorderNode(ProcessNode):
             self.log.info(
                 f'recorded {bag.saved} messages of {bag.saved_ns * 1e-9:.1f} s to {bag.path}'
             )
+            output = self._channels.get(driver_topics(self.settings).output)
+            if self._first_signals and not (output and output.recorded):
+                self._complain(
+                    'the bag holds no output of the driver, which the controller has heard: the '
+                    'recorder did not discover its publisher before the end; let the driver wait '
+                    'until its output has two subscribers, or run longer'
+                )
+        for channel in channels:
+            if channel.missed:
+                self.log.warning(f'{channel.missed} messages of {channel.name} were missed')
         if self.failure:
             unrecorded = self._received - sum(channel.recorded for channel in channels)
             self.log.warning(f'{unrecorded} messages came after the recording had stopped')
@@ -152,9 +165,12 @@ class RecorderNode(ProcessNode):
                 f'{bag.saved_ns * 1e-9:.1f} s; all else goes on. Make room, then: '
                 f'{REPAIR_COMMAND} {bag.path}'
             )
-            self.log.error(self.failure)
-            emit('complaint', text=self.failure)
+            self._complain(self.failure)
             return False
+
+    def _complain(self, text: str) -> None:
+        self.log.error(text)
+        emit('complaint', text=text)
 
     def _record(self, topic: str, message_type: type[Any], qos: QoSProfile | int) -> None:
         channel = self._channels[topic] = RecordedTopic(
@@ -167,9 +183,13 @@ class RecorderNode(ProcessNode):
         self._with_bag(announce)
 
     def _on_message(self, topic: str, message: bytes, info: dict[str, Any]) -> None:
-        channel = self._channels[topic]
+        channel, sequence = self._channels[topic], info['publication_sequence_number']
         channel.received += 1
         channel.newest = message
+        # Each of several publishers has numbers of its own.
+        if UNNUMBERED not in (sequence, channel.sequence) and topic != topics.DIAGNOSTICS:
+            channel.missed += max(sequence - channel.sequence - 1, 0)
+        channel.sequence = sequence
         if (connection := channel.connection) is not None:
             stamp_ns = info['source_timestamp'] if self._now_ns is None else self._now_ns
             channel.recorded += self._with_bag(lambda bag: bag.write(connection, stamp_ns, message))
