@@ -88,6 +88,20 @@ def _roots(draw: st.DrawFn, count: int, radii: st.SearchStrategy) -> list[comple
     return roots
 
 
+# Second order, 20 Hz, damping 0.5, at 200 Hz, as in geared_motor.yaml.
+GEAR: dict[str, object] = {
+    'sample_period': 0.005, 'plant.numerator': [0.15678154198771987, 0.12688103331610767],
+    'plant.denominator': [1.0, -1.2498255157872757, 0.5334880910911033],
+}
+
+
+def known_backlash(m: float, c_r: float, c_l: float) -> dict[str, object]:
+    """The backlash of the plant, and the same told to the law that learns none."""
+    values = {'m': m, 'c_r': c_r, 'c_l': c_l}
+    return {'estimator.law': 'fixed', **{f'{of}.{name}': value for name, value in values.items()
+                                         for of in ('backlash', 'estimator.initial')}}
+
+
 def paper_example(**changes: object) -> Parameters:
     """The paper's example with LMS and a noise-free output; `__` in a name stands for a dot."""
     values: dict[str, object] = {'estimator.law': 'lms', 'estimator.output_noise_std': 0.0}

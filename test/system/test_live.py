@@ -95,10 +95,6 @@ OPTIONS = (
 MOVING = ['gap', 'output', 'loop', 'command']  # a slope that is known stays where it is
 WHOLE_RUN = ('--config', 'geared_motor.yaml', '--duration', 'inf', '--no-record', '--live')
 
-pytestmark = pytest.mark.skipif(
-    CHROMIUM is None, reason='Chromium is not installed: apt-get install chromium'
-)
-
 
 class Tab:
     """A page that is open. errors: what its script has failed with."""
@@ -183,6 +179,7 @@ async def look(session: Session, profile: Path) -> None:
         assert tab.errors == []
 
 
+@pytest.mark.skipif(CHROMIUM is None, reason='Chromium is missing: apt-get install chromium')
 def test_numbers_and_curves_move_until_ctrl_c(start, tmp_path):
     session = start(*WHOLE_RUN)
     asyncio.run(asyncio.wait_for(look(session, tmp_path / 'profile'), 2.0 * DEADLINE_S))

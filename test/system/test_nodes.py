@@ -1,6 +1,7 @@
 """The nodes as processes: what they refuse and say, how they end, what goes on after them."""
 
 import json
+import re
 import signal
 import subprocess
 from contextlib import suppress
@@ -11,17 +12,28 @@ from typing import Any
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from drivers.paced_driver import OF_THE_LOOP, PERIOD_S, TRUTH, PacedDriver, controller_and_driver
+from places import ROOT
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from ros_processes import NodeProcess, ros_world, wait_until
-from shown_layouts import PATHS, TYPES
 from std_msgs.msg import Float32, Float64, Float64MultiArray
 
 from backlash_ros import topics
 from backlash_ros.core.loop.learned_model import from_fields
 from backlash_ros.core.parameters import Parameters
 
+TYPES = {'std_msgs/msg/Float64': Float64, 'std_msgs/msg/Float64MultiArray': Float64MultiArray}
+# What the shipped layouts draw: PlotJuggler writes /topic/field[0], Foxglove /topic.field[0].
+SHOWN = {
+    'plotjuggler.xml': r'(?:name|curve_x|curve_y)="(/\S+)/(\w+)(?:\[(\d+)\])?"',
+    'foxglove.json': r'"value": *"(/[\w/]+)\.(\w+)(?:\[(\d+)\])?"',
+}
+# Topic, field and index, -1 without one.
+PATHS = {
+    (topic, field, int(index or -1)) for name, path in SHOWN.items()
+    for topic, field, index in re.findall(path, (ROOT / 'config' / name).read_text())
+}
 RATE_MAX = 150.0
 STEP = RATE_MAX * PERIOD_S * (1.0 + 1e-9)
 STANDING = 5.13  # v at which a driver is found

@@ -97,6 +97,5 @@ def test_the_document_says_what_comes_out() -> None:
     page = (DOCS / 'faults.md').read_text()
     for law, structure in FIT:
         row = re.search(rf'^\| `{law}`, `{structure}` \|(.*)\|$', page, re.MULTILINE)
-        assert row is not None
         cells = [cell.strip() for cell in row[1].split('|')]
         assert cells == [outcome(samples_of(law, structure, name)) for name in CONDITIONS]

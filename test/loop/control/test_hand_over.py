@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from strategies import GEAR, known_backlash
 
 from backlash_ros.core import Parameters, build_closed_loop, build_controller
 from backlash_ros.core.assembly import build_state_model, build_structure
@@ -11,13 +12,9 @@ from backlash_ros.core.control.controller import AdaptiveController
 from backlash_ros.core.control.tracking.design import Weights, design
 
 PARAMETERS = Parameters({
-    'structure': 'tracking', 'amplitude': 1.0, 'estimator.law': 'fixed', 'fixed.doubt': 0.1,
-    'sample_period': 0.005, 'frequency': 4.0,
-    'plant.numerator': [0.15678154, 0.12688103],
-    'plant.denominator': [1.0, -1.24982552, 0.53348809],
+    **GEAR, **known_backlash(1.0, 0.5, -0.4), 'structure': 'tracking', 'amplitude': 1.0,
+    'fixed.doubt': 0.1, 'frequency': 4.0,
     'estimator.output_noise_std': 1e-4, 'output_noise_std': 1e-4,
-    'backlash.m': 1.0, 'backlash.c_r': 0.5, 'backlash.c_l': -0.4, 'estimator.initial.m': 1.0,
-    'estimator.initial.c_r': 0.5, 'estimator.initial.c_l': -0.4,
 })
 GAP = 0.9
 

@@ -72,7 +72,6 @@ def test_a_model_without_its_delay_is_the_same_with_it(taps, pole, delay, more):
 def test_what_was_learned_is_as_sure_as_it_says() -> None:
     p = MOTOR.replaced({'truth.scale_frequency': 1.1, 'output_noise_std': 2e-3})
     found = build_closed_loop(p).run(1200).learned
-    assert found is not None
     assert found.denominator != p.plant.denominator
     z = np.exp(2j * np.pi * np.array(FREQUENCIES))
     gain = [build_true_model(p).response(np.ones(1, complex)), build_model(p).response(
@@ -259,13 +258,11 @@ def redesigned(
 
 def test_feedback_softens_until_the_loop_is_as_safe_as_the_one_it_replaces() -> None:
     safe = redesigned(motor(), motor(0.5), WEIGHTS)
-    assert safe is not None
     assert safe.feedback.state == pytest.approx(safe.plans[0].gains.state)
     # With an integral the loop around a motor half as fast would keep less than around either.
     weights = Weights(1e-2, 1e-3, 60)
     present = design(StateModel(motor()), weights)
     softer = redesigned(motor(), motor(0.5), weights)
-    assert softer is not None
     nominal = design(softer.model, weights)
     had = min(modulus_margin(plant, present.model, present.feedback)
               for plant in (present.model, softer.model))

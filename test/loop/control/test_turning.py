@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy import signal
+from strategies import GEAR, known_backlash
 
 from backlash_ros.core import Parameters, build_closed_loop
 from backlash_ros.core.assembly import build_model
@@ -17,22 +18,18 @@ from backlash_ros.core.reference.signal import ReferenceSignal
 from backlash_ros.core.simulation.run_record import turns
 
 Array = NDArray[np.float64]
-PERIOD, GAP = 0.005, 0.9
-KNOWN = {'m': 0.098, 'c_r': 0.55, 'c_l': -0.35}
-GEAR: dict[str, object] = {
-    'sample_period': PERIOD, 'plant.numerator': [0.15678154198771987, 0.12688103331610767],
-    'plant.denominator': [1.0, -1.2498255157872757, 0.5334880910911033],
-    'structure': 'tracking', 'estimator.law': 'fixed', 'estimator.output_noise_std': 1.1e-4,
-    'output_quantum': 3.834951969714103e-4, 'inverse.take_up_rate': 100.0,
-    'control.min': -12.6, 'control.max': 12.6, 'control.rate_max': 300.0,
-    **{f'estimator.initial.{name}': value for name, value in KNOWN.items()},
-    **{f'backlash.{name}': value for name, value in KNOWN.items()},
+PERIOD, M, GAP = 0.005, 0.098, 0.9
+KNOWN: dict[str, object] = {
+    **GEAR, **known_backlash(M, 0.55, -0.35), 'structure': 'tracking',
+    'estimator.output_noise_std': 1.1e-4, 'output_quantum': 3.834951969714103e-4,
+    'inverse.take_up_rate': 100.0, 'control.min': -12.6, 'control.max': 12.6,
+    'control.rate_max': 300.0,
 }
 
 
 def moved(asked: Array, noise: float = 0.0, **changes: object) -> tuple[Array, float]:
     """v, and the RMS of y before the sensor against what is asked for without noise."""
-    p = Parameters({**GEAR, **{name.replace('__', '.'): v for name, v in changes.items()}})
+    p = Parameters({**KNOWN, **{name.replace('__', '.'): v for name, v in changes.items()}})
     heard = asked + noise * np.random.default_rng(1).standard_normal(len(asked))
     loop = build_closed_loop(p)
     loop.reference = ReferenceSignal(Parameters({
@@ -45,7 +42,7 @@ def moved(asked: Array, noise: float = 0.0, **changes: object) -> tuple[Array, f
 
 
 @pytest.mark.parametrize('band', [0.0, 1e-2])
-@pytest.mark.parametrize('noise', [0.0, 1e-4, 0.1 * GAP * KNOWN['m']])
+@pytest.mark.parametrize('noise', [0.0, 1e-4, 0.1 * GAP * M])
 def test_noise_of_the_reference_does_not_make_v_cross_the_gap(noise: float, band: float) -> None:
     asked = 0.5 * np.sin(0.5 * np.arange(0.0, 20.0, PERIOD))
     v, error = moved(asked, noise, inverse__direction_band=band)
@@ -67,7 +64,7 @@ def test_what_is_left_of_u_beside_an_integrator_does_not_make_v_cross_the_gap() 
     assert turns(v, 0.5 * GAP) <= turns(ideal, 0.01 * GAP) + 2
 
 
-@pytest.mark.parametrize('noise', [1.1e-3, 0.1 * GAP * KNOWN['m']])
+@pytest.mark.parametrize('noise', [1.1e-3, 0.1 * GAP * M])
 @pytest.mark.parametrize('rests_from', [12.0, 9.0])
 def test_noise_of_y_larger_than_configured_does_not_make_v_cross_the_gap(noise, rests_from):
     asked = 0.5 * np.sin(1.5 * np.minimum(np.arange(0.0, 12.0, PERIOD), rests_from))
@@ -98,11 +95,8 @@ def test_moves_with_rests_cross_the_gap_where_they_turn() -> None:
 def test_feedback_is_as_hard_as_its_noise_beside_the_gap_allows(noise: float) -> None:
     # Full feedback around three slow poles makes many gaps of this noise, and v turns for it.
     told = max(noise, 1e-9)
-    p = Parameters({
-        'structure': 'tracking', 'estimator.law': 'fixed', 'estimator.initial.m': 1.3,
-        'estimator.initial.c_r': 3.0, 'estimator.initial.c_l': -3.0, 'output_noise_std': noise,
-        'estimator.output_noise_std': told,
-    })
+    p = Parameters({**known_backlash(1.3, 3.0, -3.0), 'structure': 'tracking',
+                    'output_noise_std': noise, 'estimator.output_noise_std': told})
     asked = 2.0 * moves_with_rests(2, 4, 200)
     loop = build_closed_loop(p)
     loop.reference = ReferenceSignal(

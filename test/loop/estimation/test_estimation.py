@@ -72,7 +72,6 @@ def test_crossings_walk_with_a_disturbance_of_u(known: float) -> None:
     std = job.changes['truth.walk_std'] if known else 0.0
     changes = {**job.changes, 'estimator.input_noise_std': std}
     run = run_job(replace(job, changes=changes, seconds=7.0)).judged
-    assert run is not None
     assert run.tracking.mean() > 0.5
     assert run.wrong < 0.02
     # Off by what the disturbance moves between two fits: 0.02 of the gap in a second.
@@ -127,7 +126,6 @@ def test_a_bound_that_keeps_a_good_estimate_back_is_named_with_what_was_found(na
     run = loop.run(round(2 * 2.0 * np.pi / 4.0 / p.sample_period))
     assert (run.column('status') == Status.ACQUIRING).all()
     found = loop.controller.estimator.report.forbidden
-    assert found is not None
     assert (found.name, found.bound) == (name, bound)
     assert found.value == pytest.approx(value, rel=0.01)
 

@@ -48,7 +48,6 @@ def test_other_parameters_part_from_the_run_and_learn_from_its_v() -> None:
     run = build_closed_loop(parameters).run(300)
     again = replay(run, parameters.replaced({'plant.uncertainty': 0.1}))
     parted = parting(run, again)
-    assert parted is not None
     assert parted.t == pytest.approx(0.01 * parted.sample)
     assert parted.recorded != parted.replayed
     assert again.column('v').tolist() == run.column('v').tolist()
@@ -122,7 +121,7 @@ START_NS, PERIOD_NS = 1_800_000_000_000_000_000, 10_000_000
 SAMPLES, LIMIT = 200, 4.0
 LABELS = {topics.SIGNALS: topics.SIGNAL_LABELS, topics.ESTIMATES: topics.ESTIMATE_LABELS}
 LOST = {60, 61, 150}  # outputs that never reach the controller
-GIVEN = {'plant.uncertainty': 0.0, 'output_noise_std': 1e-3, 'estimator.output_noise_std': 1e-3}
+GIVEN = {'plant.uncertainty': 0.0, **NOISY}
 
 
 class LimitingDriver:
@@ -161,7 +160,6 @@ class LimitingDriver:
     def _answer(self, loop: ControlLoop, output: Output, y_m: float) -> None:
         loop.take_reference(y_m)
         step = loop.answer(output)
-        assert step is not None
         loop.core.refine()
         self._rows.append(row_of(0.01 * loop.counter.index, step.y, step.v, np.nan, step,
                                  loop.core.estimator))

@@ -225,7 +225,6 @@ def test_lms_learns_the_papers_backlash_to_1_percent_within_5_s() -> None:
         assert time is not None, f'{name} ends at {run.column(name)[-1]}'
         assert time <= 5.0, name
     error = control_error_rms(run)
-    assert error is not None
     assert error < 1e-3
 
 

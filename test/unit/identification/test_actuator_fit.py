@@ -47,7 +47,6 @@ def found() -> Identification:
 
 def test_lag_and_wind_up_are_found() -> None:
     actuator = with_actuator(found(), record()[0]).actuator
-    assert actuator is not None
     assert actuator.wind_up == pytest.approx((0.05, 0.03), rel=0.02)
     w = np.exp(1j * np.geomspace(0.01, 0.3, 20))
     true = np.polyval((0.03, 0.02), w) / np.polyval((1.0, -1.6, 0.65), w)
@@ -90,7 +89,6 @@ def test_a_csv_keeps_the_commands_beside_v(tmp_path: Path) -> None:
     path = tmp_path / 'record.csv'
     write_record(Record(motor, y, PERIOD, commands=commands), path)
     read = read_record(path)
-    assert read.commands is not None
     np.testing.assert_allclose(read.commands, commands)
     np.testing.assert_allclose(read.v, motor)
     write_record(Record(motor, y, PERIOD), path)
@@ -105,6 +103,5 @@ def test_messages_tell_commands_and_reports_of_each_interval() -> None:
     read = from_messages({
         'plant_output': (stamps, np.zeros(50)), 'applied_control': reports, 'control': control,
     }, PERIOD)
-    assert read.commands is not None
     assert read.v[:8].tolist() == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0]
     assert read.commands[:8].tolist() == [1.0, 1.0, 1.0, 1.0, 1.0, 105.0, 106.0, 107.0]

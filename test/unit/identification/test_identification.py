@@ -52,7 +52,6 @@ def test_random_actuators_are_found_to_within_their_deviations(seed: int) -> Non
     assert case.delay in found.model.delays
     for name, true in (('gap', case.gap), ('c_r', case.c_r), ('c_l', case.c_l)):
         assert abs(getattr(found, name) - true) < max(4.0 * found.std[name], 1e-9)
-    assert found.details is not None
     w = found.model.frequencies
     ratio = found.details.response.at(w) * np.exp(-1j * w * found.model.delay) / case.response(w)
     assert np.abs(ratio - 1.0).max() < 0.03
@@ -104,7 +103,6 @@ def test_a_y_that_is_read_every_few_samples_alone_is_enough(every: int) -> None:
     v, y = record()
     y[np.arange(len(y)) % every != 0] = np.nan
     found = identify(v, y, PERIOD_S, QUICK)
-    assert found.verdict is not None
     assert found.verdict.backlash.known
     assert found.gap == pytest.approx(0.9, abs=4.0 * found.std['gap'])
     assert found.std['gap'] < 0.02

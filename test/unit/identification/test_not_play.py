@@ -79,7 +79,6 @@ OTHERS: dict[str, tuple[Callable[[Array], Array], str]] = {
 
 def named(o: Observed) -> str:
     answer = what_it_is(o)
-    assert answer is not None
     assert answer.cure
     return answer.reason
 

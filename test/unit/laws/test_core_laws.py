@@ -6,20 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from strategies import (
-    NO_STATE,
-    PAPER_DENOMINATOR,
-    PAPER_NUMERATOR,
-    KnownInput,
-    eighths,
-    output_of,
-    plants,
-)
+from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR, KnownInput, eighths, output_of, plants
 
 from backlash_ros.core.assembly import build_controller, build_plant, build_reference
-from backlash_ros.core.control.inverse import BacklashInverse
-from backlash_ros.core.control.paper_structure import Proportional
-from backlash_ros.core.control.protocol import Command, ControlInput
 from backlash_ros.core.estimate import Bounds, Estimate, Status
 from backlash_ros.core.law import Interval
 from backlash_ros.core.laws.input_reconstruction import InputReconstruction
@@ -27,27 +16,8 @@ from backlash_ros.core.laws.printed_law import PrintedLaw, printed_c, printed_f,
 from backlash_ros.core.parameters import ParameterError, Parameters
 from backlash_ros.core.plant.transfer_function import TransferFunction
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
-from backlash_ros.core.simulation.run_record import RunRecord
 
-
-def feed(estimator: PrintedLaw, u: float, y_m: float) -> Estimate:
-    estimator.update(u, Interval(v=0.0, y_m=y_m, u_d=0.0, f=estimator.estimate.f))
-    return estimator.estimate
-
-
-WIDE = Bounds((1e-9, 1e9), (0.0, 1e9), (-1e9, 0.0))
-WIDE_F = (-1e9, 1e9)
-START = Estimate(0.696, 0.5, -0.5, 0.22)
 SMALL = eighths(-80, 80)
-
-
-def law(initial: Estimate = START, bounds: Bounds = WIDE,
-        f_bounds: tuple[float, float] = WIDE_F) -> PrintedLaw:
-    return PrintedLaw(initial, bounds, f_bounds, KnownInput())  # type: ignore[arg-type]
-
-
-def control(y_m: float, estimate: Estimate, inverse: BacklashInverse) -> Command:
-    return Proportional().control(ControlInput(y_m, 0.0, estimate, NO_STATE), inverse)
 
 
 @given(u=SMALL, y_m=SMALL, m=eighths(1, 80), w=SMALL)
@@ -73,9 +43,10 @@ def test_printed_c_reduces_to_the_solution_of_e_equal_0(u, y_m, f, m):
 @given(data=st.lists(st.tuples(st.floats(-20.0, 20.0), st.floats(-20.0, 20.0)), max_size=40))
 def test_guarded_law_stays_finite_and_within_its_bounds(data: list[tuple[float, float]]) -> None:
     bounds = Bounds()
-    estimator = law(bounds=bounds, f_bounds=(-0.5, 0.5))
+    estimator = PrintedLaw(Estimate(0.696, 0.5, -0.5, 0.22), bounds, (-0.5, 0.5), KnownInput())
     for u, y_m in [(0.0, 0.0), *data]:
-        e = feed(estimator, u, y_m)
+        estimator.update(u, Interval(v=0.0, y_m=y_m, u_d=0.0, f=estimator.estimate.f))
+        e = estimator.estimate
         assert bounds.m[0] <= e.m <= bounds.m[1]
         assert bounds.c_r[0] <= e.c_r <= bounds.c_r[1]
         assert bounds.c_l[0] <= e.c_l <= bounds.c_l[1]
@@ -94,14 +65,10 @@ def four_blocks(**changes: object) -> Parameters:
     })
 
 
-def last(run: RunRecord) -> dict[str, float]:
-    return {name: float(run.column(name)[-1]) for name in TRUTH}
-
-
 @pytest.mark.parametrize('amplitude', [0.05, 0.2, 1.0])
 def test_learns_all_three_from_the_tracking_error(amplitude: float) -> None:
     run = build_closed_loop(four_blocks(amplitude=amplitude)).run(2000)
-    assert last(run) == pytest.approx(TRUTH, rel=0.01)
+    assert {name: run.column(name)[-1] for name in TRUTH} == pytest.approx(TRUTH, rel=0.01)
 
 
 def test_says_that_y_moves_against_v() -> None:
@@ -113,30 +80,16 @@ def test_says_that_y_moves_against_v() -> None:
     assert step.estimate.status is Status.INCONSISTENT
 
 
-Array = np.ndarray
 LAG = 30
 PAPER = TransferFunction(PAPER_NUMERATOR, PAPER_DENOMINATOR)
 
 
-def play_output(samples: int = 400) -> Array:
-    return np.clip(14.0 * np.sin(0.126 * np.arange(samples)), -10.0, 10.0)
-
-
-def reconstructed(
-    reconstruction: InputReconstruction, y: Array, lost: tuple[int, ...] = (),
-) -> Array:
-    """u_hat, shifted so that element k belongs to u(k); nan where y is too short."""
-    lagged = [reconstruction.update(None if k in lost else float(y[k])) for k in range(len(y))]
-    result = np.full(len(y), np.nan)
-    result[: len(y) - reconstruction.lag] = lagged[reconstruction.lag:]
-    return result
-
-
-def error(model: TransferFunction, noise_std: float = 0.0, lag: int = LAG,
-          lost: tuple[int, ...] = (), samples: int = 400) -> Array:
-    u = play_output(samples)
-    u_hat = reconstructed(InputReconstruction(model, noise_std, lag), output_of(model, u), lost)
-    return (u_hat - u)[2 * lag: samples - lag]
+def error(model: TransferFunction, lost: set[int] = frozenset(), samples: int = 400) -> np.ndarray:
+    u = np.clip(14.0 * np.sin(0.126 * np.arange(samples)), -10.0, 10.0)
+    smoother = InputReconstruction(model, 0.0, LAG)
+    late = [smoother.update(None if k in lost else float(y))
+            for k, y in enumerate(output_of(model, u))]
+    return np.array(late[3 * LAG:]) - u[2 * LAG:samples - LAG]
 
 
 @given(model=plants())
@@ -146,8 +99,7 @@ def test_u_is_exact_after_the_lag_without_noise(model: TransferFunction) -> None
 
 @given(model=plants(), lost=st.sets(st.integers(100, 140), max_size=10))
 def test_lost_samples_do_not_put_it_out_of_step(model: TransferFunction, lost: set[int]) -> None:
-    late = error(model, lost=tuple(lost), samples=600)[300:]
-    assert np.abs(late).max() < 1e-3
+    assert np.abs(error(model, lost, 600)[300:]).max() < 1e-3
 
 
 @pytest.mark.parametrize('noise_std', [1e-4, 1e-3])

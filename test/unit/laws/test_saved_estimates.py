@@ -33,7 +33,6 @@ def test_saved_estimate_comes_back_to_the_last_bit(tmp_path_factory, m, c_r, c_l
     estimate = Estimate(m, c_r, c_l, f, std, std, std)
     save_estimate(Path(p.estimates.file), estimate, p)
     loaded = load_estimate(p)
-    assert loaded is not None
     assert (loaded.m, loaded.c_r, loaded.c_l, loaded.f) == (m, c_r, c_l, f)
     assert loaded.std_m == std or (isnan(std) and not loaded.learned)
 

@@ -83,6 +83,7 @@ LEARNS = """
 import sys
 import time
 from math import sin
+import backlash_ros.nodes.controller
 from backlash_ros.core.assembly import WORKER_MODULES, build_controller, build_plant
 from backlash_ros.core.jobs import WorkerExecutor
 from backlash_ros.core.parameters import Parameters

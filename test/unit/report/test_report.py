@@ -269,11 +269,6 @@ def write_pieces(path: Path, *pieces: Piece) -> Path:
 
 
 @pytest.fixture(scope='module')
-def first() -> RunRecord:
-    return build_closed_loop(PARAMETERS).run(120)
-
-
-@pytest.fixture(scope='module')
 def second() -> RunRecord:
     return build_closed_loop(OTHER).run(90)
 
@@ -285,9 +280,9 @@ def same(found: RunRecord, run: RunRecord) -> bool:
 
 @pytest.mark.usefixtures('undrawn')
 def test_bag_of_a_restart_gives_a_report_of_what_came_last_and_says_so(
-    tmp_path: Path, first: RunRecord, second: RunRecord, capsys: pytest.CaptureFixture[str],
+    tmp_path: Path, run: RunRecord, second: RunRecord, capsys: pytest.CaptureFixture[str],
 ) -> None:
-    bag = write_pieces(tmp_path / 'bag', Piece(first), Piece(second, begin_s=1.5, first=40))
+    bag = write_pieces(tmp_path / 'bag', Piece(run), Piece(second, begin_s=1.5, first=40))
     assert same(read_bag(bag).record, second)
     assert report.main([str(bag), '--out', str(tmp_path / 'out')]) == 0
     line = capsys.readouterr().err.splitlines()[-1]
@@ -297,11 +292,11 @@ def test_bag_of_a_restart_gives_a_report_of_what_came_last_and_says_so(
 
 
 @pytest.mark.usefixtures('undrawn')
-def test_from_and_to_choose_the_other_part(tmp_path, first, second, capsys):
-    bag = write_pieces(tmp_path / 'bag', Piece(first), Piece(second, begin_s=1.5, first=40))
-    assert same(read_bag(bag, span=Span(to_s=1.5)).record, first)
+def test_from_and_to_choose_the_other_part(tmp_path, run, second, capsys):
+    bag = write_pieces(tmp_path / 'bag', Piece(run), Piece(second, begin_s=1.5, first=40))
+    assert same(read_bag(bag, span=Span(to_s=1.5)).record, run)
     part = read_bag(bag, span=Span(0.2, 0.7)).record
-    assert np.array_equal(part.column('y'), first.column('y')[20:70])
+    assert np.array_equal(part.column('y'), run.column('y')[20:70])
     assert part.column('t')[0] == 0.0
     assert report.main([str(bag), '--to', '1.5', '--out', str(tmp_path / 'out')]) == 0
     assert 'restarted its count' not in capsys.readouterr().err
@@ -311,28 +306,28 @@ def test_from_and_to_choose_the_other_part(tmp_path, first, second, capsys):
 
 
 @pytest.mark.usefixtures('undrawn')
-def test_saved_results_are_cut_likewise(tmp_path: Path, first: RunRecord) -> None:
-    report.write_report(Run(first, PARAMETERS), tmp_path)
+def test_saved_results_are_cut_likewise(tmp_path: Path, run: RunRecord) -> None:
+    report.write_report(Run(run, PARAMETERS), tmp_path)
     part = read_run(tmp_path, span=Span(0.5, 0.8)).record
-    assert np.array_equal(part.column('y'), first.column('y')[50:80])
+    assert np.array_equal(part.column('y'), run.column('y')[50:80])
     assert part.column('t')[0] == 0.0
 
 
-def test_truth_belongs_to_the_sample_with_its_v_where_the_counts_differ(tmp_path, first):
-    bag = write_pieces(tmp_path / 'bag', Piece(first, first=179_536_708_930, truth_first=17))
+def test_truth_belongs_to_the_sample_with_its_v_where_the_counts_differ(tmp_path, run):
+    bag = write_pieces(tmp_path / 'bag', Piece(run, first=179_536_708_930, truth_first=17))
     u = read_bag(bag).record.column('u')
-    assert np.array_equal(u, first.column('u'))
+    assert np.array_equal(u, run.column('u'))
 
 
 @pytest.mark.usefixtures('undrawn')
-def test_a_truth_that_is_stamped_before_the_first_signals_is_read(tmp_path, first):
-    bag = write_pieces(tmp_path / 'bag', Piece(first, truth_early_s=0.01))
-    np.testing.assert_array_equal(read_bag(bag).record.column('u'), first.column('u'))
+def test_a_truth_that_is_stamped_before_the_first_signals_is_read(tmp_path, run):
+    bag = write_pieces(tmp_path / 'bag', Piece(run, truth_early_s=0.01))
+    np.testing.assert_array_equal(read_bag(bag).record.column('u'), run.column('u'))
 
 
-def test_bag_of_two_axes_gives_a_report_of_either(tmp_path, first, second, capsys):
+def test_bag_of_two_axes_gives_a_report_of_either(tmp_path, run, second, capsys):
     bag = write_pieces(
-        tmp_path / 'bag', Piece(first, namespace='pan/'), Piece(second, namespace='tilt/')
+        tmp_path / 'bag', Piece(run, namespace='pan/'), Piece(second, namespace='tilt/')
     )
     assert same(read_bag(bag, axis='tilt').record, second)
     assert report.main([str(bag), '--out', str(tmp_path / 'out')]) == 0
@@ -341,8 +336,8 @@ def test_bag_of_two_axes_gives_a_report_of_either(tmp_path, first, second, capsy
     assert 'no message of controller/signals of axis roll; its topics' in capsys.readouterr().err
 
 
-def test_bag_of_two_controllers_at_once_gives_a_report(tmp_path, first, second):
-    bag = write_pieces(tmp_path / 'bag', Piece(first), Piece(second, begin_s=0.002, first=3))
+def test_bag_of_two_controllers_at_once_gives_a_report(tmp_path, run, second):
+    bag = write_pieces(tmp_path / 'bag', Piece(run), Piece(second, begin_s=0.002, first=3))
     found = read_bag(bag)
     assert 'two controllers published at once' in found.notes[-1]
-    assert found.record.samples == first.samples
+    assert found.record.samples == run.samples

@@ -230,7 +230,6 @@ def test_saved_estimates_are_begun_with() -> None:
         'estimates.load=true', f'estimates.file={OLD / "estimates.json"}',
     ])
     found = load_estimate(parameters)
-    assert found is not None
     assert {name: getattr(found, name) for name in LAST} == pytest.approx(LAST, rel=1e-5)
     assert found.learned
     assert build_controller(parameters).step(0.0, 0.0).estimate.m == pytest.approx(found.m)
