@@ -19,7 +19,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import mcap.records
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.stream_reader import StreamReader
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
@@ -225,33 +225,22 @@ class BagReader:
 
 
 def _read_mcap(file: Path, wanted: Callable[[Topic], bool]) -> Iterator[BagMessage]:
-    """Messages up to the first record that is not sound; a chunk that is not is left out."""
+    """Messages up to the first record that is not sound."""
     topics: dict[int, Topic] = {}  # the wanted ones by the number of their channel
     schemas: dict[int, mcap.records.Schema] = {}
-    broken = 0
     with file.open('rb') as stream:
         # A length that is garbage may be more than any memory holds.
         size = os.fstat(stream.fileno()).st_size
-        for found in StreamReader(stream, emit_chunks=True, record_size_limit=size).records:
-            records: list[mcap.records.McapRecord] = [found]
-            if isinstance(found, mcap.records.Chunk):
-                try:
-                    records = breakup_chunk(found, validate_crc=True)
-                except Exception:
-                    broken += 1
-                    continue
-            for record in records:
-                if isinstance(record, mcap.records.Schema):
-                    schemas[record.id] = record
-                elif isinstance(record, mcap.records.Channel):
-                    schema = schemas[record.schema_id]
-                    topic = Topic(record.topic, schema.name, schema.data.decode())
-                    if wanted(topic):
-                        topics[record.id] = topic
-                elif isinstance(record, mcap.records.Message) and record.channel_id in topics:
-                    yield BagMessage(topics[record.channel_id], record.log_time, record.data)
-    if broken:
-        raise BagError(f'{file}: {broken} chunks are damaged')
+        for record in StreamReader(stream, validate_crcs=True, record_size_limit=size).records:
+            if isinstance(record, mcap.records.Schema):
+                schemas[record.id] = record
+            elif isinstance(record, mcap.records.Channel):
+                schema = schemas[record.schema_id]
+                topic = Topic(record.topic, schema.name, schema.data.decode())
+                if wanted(topic):
+                    topics[record.id] = topic
+            elif isinstance(record, mcap.records.Message) and record.channel_id in topics:
+                yield BagMessage(topics[record.channel_id], record.log_time, record.data)
 
 
 def _read_sqlite(file: Path, wanted: Callable[[Topic], bool]) -> Iterator[BagMessage]:

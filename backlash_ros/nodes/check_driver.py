@@ -6,6 +6,7 @@ import argparse
 import sys
 import tempfile
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -34,18 +35,17 @@ class CheckDriverNode(MotionNode):
         self.exit_code = DONE if all_fit(findings) else FAILED
 
     def _save(self, path: Path) -> None:
-        record = timing_of(self.heard, self.settings.sample_period).record
+        period = self.settings.sample_period
+        record = timing_of(self.heard, period).record
         if record is None:
             self.say(f'nothing to save in {path}: v and y were not both heard')
             return
-        v, y = record
-        rows = np.column_stack([self.settings.sample_period * np.arange(len(v)), v, y])
+        rows = np.column_stack([period * np.arange(len(record[0])), *record])
         try:
             np.savetxt(path, rows, '%.12g', ',', header='t,v,y', comments='')
+            print(f'saved {len(rows)} samples of v and y in {path}')
         except OSError as error:
             self.say(f'{path}: cannot be written: {error.strerror}')
-            return
-        print(f'saved {len(v)} samples of v and y in {path}')
 
 
 def parse_options(plain: Sequence[str]) -> argparse.Namespace:
@@ -64,30 +64,23 @@ def parse_options(plain: Sequence[str]) -> argparse.Namespace:
     return options
 
 
-def _parameter_files(config: str, folder: Path) -> list[str]:
-    """The file, and in folder one more with what it holds for the controller alone, if anything."""
-    try:
-        document = yaml.safe_load(Path(config).read_text(encoding='utf-8'))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError):
-        return [config]  # rcl says what is wrong with it
-    files = [config]
-    for section in ('/**/controller', 'controller', '/controller'):
-        if isinstance(document, dict) and section in document:
-            path = folder / f'{len(files)}.yaml'
-            path.write_text(yaml.safe_dump({'/**': document[section]}), encoding='utf-8')
-            files.append(str(path))
-    return files
-
-
 def main(args: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     plain, given = split_arguments(args)
-    options = parse_options(plain)
+    options, files = parse_options(plain), list[Path]()
     with tempfile.TemporaryDirectory() as folder:
         if options.config is not None:
-            config = str(find_config(Path(options.config)))
-            for file in reversed(_parameter_files(config, Path(folder))):
-                given = ['--ros-args', '--params-file', file, *given]
+            files = [find_config(Path(options.config))]
+            # What it holds for the controller alone. Of a broken file rcl says what is wrong.
+            with suppress(OSError, UnicodeDecodeError, yaml.YAMLError, TypeError):
+                document = yaml.safe_load(files[0].read_text(encoding='utf-8'))
+                for section in ('/**/controller', 'controller', '/controller'):
+                    if section in document:
+                        path = Path(folder) / f'{len(files)}.yaml'
+                        path.write_text(yaml.safe_dump({'/**': document[section]}))
+                        files.append(path)
+        for file in reversed(files):
+            given = ['--ros-args', '--params-file', str(file), *given]
         return run('check_driver', lambda: CheckDriverNode('check_driver', options, waves), given)
 
 

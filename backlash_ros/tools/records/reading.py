@@ -42,7 +42,7 @@ def read_record(
 
 def _from_table(path: Path, period: float | None, given: Mapping[str, str]) -> Record:
     table = read_table(path)
-    chosen, said = choose_columns(table.names, given)
+    chosen, said = choose_columns([*table.columns], given)
     t, unit_s = table.times(chosen.pop('t')) if 't' in chosen else (None, None)
     signals = {role: table.numbers(name) for role, name in chosen.items()}
     record = record_of(t, signals['v'], signals['y'], period, unit_s, signals.get(COMMAND))

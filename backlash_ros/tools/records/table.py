@@ -1,8 +1,7 @@
 """A table of numbers from a file: text with any separator and any head, or Parquet.
 
-What has to be found out of a text (where its head ends, which sign separates, which one is the
-decimal sign) pandas and polars have to be told as well, and both are larger than all else that this
-package needs. Parquet is left to pyarrow, where it is installed.
+Where the head ends, which sign separates, which one is the decimal sign: pandas and polars have to
+be told as well, and are larger than all else that this package needs.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ import gzip
 import re
 import zlib
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import date
 from itertools import chain
 from math import nan
@@ -31,29 +30,25 @@ MOST_BROKEN = 0.1  # share of the lines that may be broken, and of the cells tha
 
 
 class Table(NamedTuple):
-    """Columns of a file. names: as in its head, or '1', '2', … where it has none.
+    """Cells of a file by the names in its head, or '1', '2', …; whether the comma is the decimal
+    sign."""
 
-    cells: of each column, all of one length. comma: whether it is the decimal sign of the numbers.
-    """
-
-    names: Sequence[str]
-    cells: Sequence[Sequence[str]]
+    columns: Mapping[str, Sequence[str]]
     comma: bool = False
     notes: tuple[str, ...] = ()
 
     def times(self, name: str) -> tuple[Array, float | None]:
         """Stamps (N,), and their unit [s] where the file tells it; raises RecordError."""
-        cells = self.cells[self.names.index(name)]
         # As the first ones are.
-        numeric = [_number(cell, self.comma) is not None for cell in cells[:60]]
+        numeric = [_number(cell, self.comma) is not None for cell in self.columns[name][:60]]
         if not sum(numeric) > 0.5 * len(numeric):
-            dates = times_of(cells)
+            dates = times_of(self.columns[name])
             if np.isfinite(dates).mean() > 0.5:
                 return dates, 1.0
         t = self.numbers(name, 'time')
         if re.fullmatch('date|datum', name.lower()) and 2e4 < np.nan_to_num(t).max() < 1e5:
             return t, 86400.0  # of a table calculation
-        for other in self.names:
+        for other in self.columns:
             # In two columns, as in headers of ROS messages.
             if re.fullmatch(r'(.*)n(ano)?(secs?)', other) and re.sub(
                     r'n(ano)?(secs?)$', r'\2', other).rstrip('s') == name.rstrip('s'):
@@ -64,19 +59,19 @@ class Table(NamedTuple):
         """A column as numbers (N,), nan where there is none; raises RecordError."""
         unknown = {'', 'nan', 'null', 'none', 'na', 'n/a', '-', '--', 'nil', '?', '#n/a', 'bad',
                    'missing', 'nat'}
-        cells = self.cells[self.names.index(name)]
+        cells = self.columns[name]
         values = np.array([_number(cell, self.comma) for cell in cells], dtype=float)
         broken = [k for k in np.flatnonzero(np.isnan(values)) if cells[k].lower() not in unknown]
         if len(broken) > MOST_BROKEN * len(cells):
             raise RecordError(
                 f'column {name!r}: {cells[broken[0]]!r} in row {broken[0] + 1} is no {what}, as in '
                 f'{len(broken)} of {len(cells)} rows: choose another column with --columns; '
-                f'{columns_of(self.names)}')
+                f'{columns_of([*self.columns])}')
         return values
 
     def by_name(self) -> Table:
         """With a column for each name that stands in a cell, where a row has one value."""
-        columns = dict(zip(self.names, self.cells, strict=True))
+        columns = dict(self.columns)
         of_values = [name for name in columns
                      if re.fullmatch('.*(value|data|reading)', name.lower())]
         of_names = [name for name, cells in columns.items() if 2 <= len({*cells}) <= 20
@@ -87,7 +82,7 @@ class Table(NamedTuple):
         for name in sorted({*keys}):
             columns.setdefault(name, [value if key == name else ''
                                       for key, value in zip(keys, values, strict=True)])
-        return self._replace(names=tuple(columns), cells=tuple(columns.values()))
+        return self._replace(columns=columns)
 
 
 def _number(cell: str, comma: bool) -> float | None:
@@ -193,10 +188,10 @@ def _from_text(text: str) -> Table:
     if skipped > max(MOST_BROKEN * len(body), 3.0):
         raise RecordError(f'{skipped} of {skipped + len(body)} lines are no rows of its table: '
                           f'{columns_of(names)}; leave one table with t, v and y')
-    cells = list(chain(*body))
-    comma = sum(',' in cell for cell in cells) > sum('.' in cell for cell in cells)
+    comma, point = (sum(sign in cell for cell in chain(*body)) for sign in ',.')
     notes = (f'{skipped} broken line{"s" if skipped > 1 else ""} left out',) if skipped else ()
-    return Table(names, list(zip(*body, strict=True)), comma, notes)
+    cells = zip(*body, strict=True)
+    return Table(dict(zip(names, cells, strict=True)), comma > point, notes)
 
 
 def _is_numeric(row: Sequence[str]) -> bool:
@@ -222,7 +217,7 @@ def _separator(lines: Sequence[str]) -> tuple[str, int]:
     part = [line for line in lines[begin:begin + looked_at] if re.search(r'\d', line)]
     best, most = (',', 0), 0.5
     for separator in '\t;,| ':
-        rows = [_split(line, separator) for line in part]
+        rows = (_split(line, separator) for line in part)
         counts = Counter(len(row) for row in rows if len(row) > 1 and _is_numeric(row))
         for count, times in counts.most_common(1):
             # The first of those that explain as much: a comma may be a decimal sign.
@@ -258,4 +253,4 @@ def _from_parquet(path: Path) -> Table:
         cells = [column.to_numpy().astype(str).tolist() for column in table.columns]
     except (ArrowException, OSError, ValueError) as error:
         raise RecordError(f'cannot be read: {" ".join(str(error).split())}') from None
-    return Table(table.column_names, cells)
+    return Table(dict(zip(table.column_names, cells, strict=True)))
