@@ -1,10 +1,8 @@
 """Estimates of the backlash: their values, how far to trust them, and their bounds."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import IntEnum
-from math import isnan
+from math import isnan, nan
 
 from backlash_ros.core.parameters import ParameterError
 
@@ -20,24 +18,20 @@ class Status(IntEnum):
 
     @property
     def word(self) -> str:
-        """Its name as people write it."""
         return self.name.lower().replace('_', ' ')
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Estimates of the backlash and their standard deviations (nan where the law has none).
-
-    m [unit of u / unit of v], c_r and c_l [unit of v], f of (3.2).
-    """
+    """m [u / v], c_r, c_l [v] and f of (3.2), and deviations, nan where the law has none."""
 
     m: float
     c_r: float
     c_l: float
     f: float
-    std_m: float = float('nan')
-    std_c_r: float = float('nan')
-    std_c_l: float = float('nan')
+    std_m: float = nan
+    std_c_r: float = nan
+    std_c_l: float = nan
     status: Status = Status.ACQUIRING
 
     @property
@@ -48,28 +42,22 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Bounds:
-    """Projection intervals (low, high) of the estimates; 0 < m, c_l <= c_r.
-
-    A constant offset moves both crossings, which may then lie on the same side of 0.
-    """
+    """Projection intervals (low, high) of the estimates; 0 < m, c_l <= c_r."""
 
     m: tuple[float, float] = (0.01, 100.0)
     c_r: tuple[float, float] = (-100.0, 100.0)
     c_l: tuple[float, float] = (-100.0, 100.0)
 
     def __post_init__(self) -> None:
-        for name, (low, high) in (('m', self.m), ('c_r', self.c_r), ('c_l', self.c_l)):
+        for name, (low, high) in vars(self).items():
             if not low < high:
-                raise ParameterError(
-                    f'estimator.bounds.{name}', [low, high], 'must be [low, high] with low < high'
-                )
+                raise ParameterError(f'estimator.bounds.{name}', [low, high],
+                                     'must be [low, high] with low < high')
         if not self.m[0] > 0.0:
             raise ParameterError('estimator.bounds.m', list(self.m), 'must have low > 0')
         if not self.c_l[0] < self.c_r[1]:
-            raise ParameterError(
-                'estimator.bounds.c_l', list(self.c_l),
-                f'must have low < {self.c_r[1]:g}, the largest c_r',
-            )
+            raise ParameterError('estimator.bounds.c_l', list(self.c_l),
+                                 f'must have low < {self.c_r[1]:g}, the largest c_r')
 
     def project(self, m: float, c_r: float, c_l: float) -> tuple[float, float, float]:
         """(m, c_r, c_l) inside the bounds, and c_l at c_r where it would lie to the right of it."""
@@ -77,8 +65,7 @@ class Bounds:
         c_r = min(max(c_r, self.c_r[0]), self.c_r[1])
         c_l = min(max(c_l, self.c_l[0]), self.c_l[1])
         if c_l > c_r:
-            middle = 0.5 * (c_l + c_r)
-            c_r = min(max(middle, self.c_r[0], self.c_l[0]), self.c_r[1])
+            c_r = min(max(0.5 * (c_l + c_r), self.c_r[0], self.c_l[0]), self.c_r[1])
             c_l = min(c_r, self.c_l[1])
         return m, c_r, c_l
 

@@ -5,23 +5,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import nan
-from typing import ClassVar, NamedTuple, Protocol
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.plant.transfer_function import StateModel
-
-Array = NDArray[np.float64]
+from backlash_ros.core.plant.transfer_function import Array, StateModel
 
 
 class Interval(NamedTuple):
     """What the controller did between two samples: v was applied, y_m and u_d led to it.
 
-    f: the gain of (3.2) that was in use. other: v that may have been applied instead, nan where
-    there is no doubt.
+    f: the gain of (3.2) in use. other: v that may have been applied instead, nan for no doubt.
     """
 
     v: float
@@ -41,67 +38,23 @@ class OutOfBounds(NamedTuple):
 
 @dataclass(frozen=True)
 class LawReport:
-    """What a law knows of its own work; the defaults are those of a law that does not learn it.
+    """What a law knows of its own work; the defaults are those of a law that does not learn it."""
 
-    noise_ratio: standard deviation of the noise on y as learned over the configured one.
-    unexplained: motion of u that no backlash and no G explains, over m times the gap. coasts: there
-    is no better estimate because the load runs on within the gap. unconfirmed: the estimate was
-    learned before this run, and its samples do not confirm it yet. wrong_sign: there is no
-    estimate because y moves against v. undecided: there is none though v went back and forth, as
-    several gaps explain y alike. forbidden: what keeps an estimate that is good otherwise from
-    being published. waiting: samples that no fit has taken in yet. outliers:
-    readings rejected so far. reattributed: intervals so far over which another v acted than
-    the one commanded. failed_fits: fits so far without a result.
-    """
-
-    noise_ratio: float = nan
-    unexplained: float = nan
-    coasts: bool = False
-    unconfirmed: bool = False
-    wrong_sign: bool = False
-    undecided: bool = False
-    forbidden: OutOfBounds | None = None
-    waiting: int = 0
-    outliers: int = 0
-    reattributed: int = 0
-    failed_fits: int = 0
+    noise_ratio: float = nan  # standard deviation of the noise on y, over the configured one
+    unexplained: float = nan  # motion of u that no backlash and no G explains, over m times the gap
+    coasts: bool = False  # whether no estimate is better because the load runs on within the gap
+    unconfirmed: bool = False  # whether samples do not confirm yet what was known before the run
+    wrong_sign: bool = False  # whether there is no estimate because y moves against v
+    undecided: bool = False  # whether there is none as several gaps explain y alike
+    forbidden: OutOfBounds | None = None  # what keeps a good estimate from being published
+    waiting: int = 0  # samples that no fit has taken in yet
+    outliers: int = 0  # readings rejected so far
+    reattributed: int = 0  # intervals so far over which another v acted than the one commanded
+    failed_fits: int = 0  # fits so far without a result
 
 
-class StateSource(Protocol):
-    """Knows the state of G."""
-
-    @property
-    def x_hat(self) -> Sequence[float] | Array:
-        """State of G given y(..k) in the coordinates of StateModel, shape (n,)."""
-
-    @property
-    def x_cov(self) -> Array | None:
-        """Covariance of x_hat, shape (n, n); None where the law has none."""
-
-
-class Law:
-    """Learns (m, c_r, c_l), and f where it adapts it, from v and y alone.
-
-    Laws inherit from here what they do not do themselves. estimate: the newest one. adapting:
-    whether it learns; otherwise it goes on following the state of G alone. RETUNED: names of the
-    parameters that `retune` takes up.
-    """
-
-    RETUNED: ClassVar[tuple[str, ...]] = ()
-    estimate: Estimate
-    adapting: bool = True
-
-    # --- at every sample ------------------------------------------------------------------------
-
-    def update(self, y: float | None, interval: Interval) -> None:
-        """Take in y(k), None if it was lost, and what was applied from k-1 to k."""
-
-    def refine(self) -> None:
-        """Do what the command of this sample need not wait for.
-
-        A law whose fits are made elsewhere (jobs.py) takes up those that are
-        finished, and submits the one that is due.
-        """
+class StateSource:
+    """Knows the state of G, or does not."""
 
     @property
     def x_hat(self) -> Sequence[float] | Array:
@@ -110,8 +63,26 @@ class Law:
 
     @property
     def x_cov(self) -> Array | None:
-        """Covariance of x_hat, shape (n, n); None where the law has none."""
+        """Covariance of x_hat, shape (n, n); None where there is none."""
         return None
+
+
+class Law(StateSource):
+    """Learns (m, c_r, c_l), and f where it adapts it, from v and y alone.
+
+    Laws inherit from here what they do not do themselves. adapting: whether it learns; otherwise it
+    goes on following the state of G alone. RETUNED: names of parameters that `retune` takes up.
+    """
+
+    RETUNED: ClassVar[tuple[str, ...]] = ()
+    estimate: Estimate
+    adapting: bool = True
+
+    def update(self, y: float | None, interval: Interval) -> None:
+        """Take in y(k), None if it was lost, and what was applied from k-1 to k."""
+
+    def refine(self) -> None:
+        """Do what the command of this sample need not wait for."""
 
     @property
     def u_hat(self) -> float:
@@ -122,8 +93,6 @@ class Law:
     def innovation(self) -> float:
         """y(k) minus its prediction from the samples before; nan where y(k) was lost."""
         return nan
-
-    # --- of G, for laws that learn it -----------------------------------------------------------
 
     @property
     def learned_model(self) -> StateModel | None:
@@ -145,11 +114,8 @@ class Law:
         """
         return np.full(len(z), nan)
 
-    # --- now and then ---------------------------------------------------------------------------
-
     @property
     def report(self) -> LawReport:
-        """How its work goes."""
         return LawReport()
 
     def retune(self, p: Parameters) -> None:

@@ -208,7 +208,7 @@ def _designed(make: Callable[[], object | None]) -> tuple[object | None]:
     return make(),
 
 
-class SerialPlant:
+class SerialPlant(StateSource):
     """A motor with its position loop L(z), and G behind it, as one plant of the command.
 
     Where v is the position of a motor encoder, the estimator learns G from that; the structure
