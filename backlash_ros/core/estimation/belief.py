@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from enum import Enum, auto
-from math import inf, sqrt
+from math import inf, nan, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +13,7 @@ from backlash_ros.core.estimate import Status
 from backlash_ros.core.estimation import settings
 from backlash_ros.core.estimation.explanations import Setup, Window
 from backlash_ros.core.estimation.fit import Problem
-from backlash_ros.core.estimation.posterior import Prior, Start, WindowFit, agree
+from backlash_ros.core.estimation.posterior import Prior, WindowFit, agree
 from backlash_ros.core.plant.backlash import Region, engaged, reversals
 from backlash_ros.core.plant.transfer_function import Array
 
@@ -42,7 +42,6 @@ class Kept(NamedTuple):
 
     first: int = 0
     older: Prior | None = None
-    start: Start | None = None
     rejected: frozenset[int] = frozenset()
     swapped: frozenset[int] = frozenset()
 
@@ -163,32 +162,31 @@ def shortened(
     if cut < count // 6:
         return belief, fit
     rest = record.between(record.first + cut)
-    old = setup.problem(record.between(record.first, rest.first), kept.older, kept.start)
+    old = setup.problem(record.between(record.first, rest.first), kept.older)
     p = old.at(fit).p
-    side, start = engaged(old.v, p, fit.gap)[-1], None
-    if side != Region.GAP:
-        left = bool(side == Region.LEFT)
-        start = Start(float(p[-1] - fit.gap if left else p[-1]), left)
+    side = engaged(old.v, p, fit.gap)[-1]
+    left = bool(side == Region.LEFT)
+    v = nan if side == Region.GAP else float(p[-1] - fit.gap if left else p[-1])
     begin = replace(fit, p0=float(p[-1]), x=np.zeros(len(fit.x)), knots=np.zeros(0))
     older = _aged(setup, fit, old.remembered(replace(fit, knots=begin.knots)), cut)
-    for beside in ((older, start), (None, None)):
-        problem = setup.problem(rest, *beside)
+    for beside in (older._replace(v=v, left=left), None):
+        problem = setup.problem(rest, beside)
         shorter = problem.finished(problem.fitted(problem.begun(begin)))
         if shorter.left.rms < 2.0 * fit.left.rms:
             break
     rejected, swapped = (frozenset(k for k in numbers if k >= rest.first)
                          for numbers in (kept.rejected, kept.swapped))
-    return belief._replace(kept=Kept(rest.first, *beside, rejected, swapped)), shorter
+    return belief._replace(kept=Kept(rest.first, beside, rejected, swapped)), shorter
 
 
-def _aged(setup: Setup, fit: WindowFit, prior: Prior, samples: int) -> Prior | None:
-    """What is left of a prior after so many samples of drift and walk; None for too little."""
+def _aged(setup: Setup, fit: WindowFit, prior: Prior, samples: int) -> Prior:
+    """What is left of a prior after so many samples of drift and walk."""
     rows, values = prior.rows / sqrt(fit.inflation), prior.values / sqrt(fit.inflation)
     if setup.drift.any():
         try:
             cov = np.linalg.inv(rows.T @ rows)
         except np.linalg.LinAlgError:
-            return None
+            return Prior(rows[:0], values[:0])
         m, c_r, _ = fit.crossings
         by = np.array([[1.0, 0.0, 0.0], [c_r, m, 0.0], [0.0, 1.0, -1.0]])  # of m, o, g
         theta = np.linalg.lstsq(rows, values, rcond=None)[0]

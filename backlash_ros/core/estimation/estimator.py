@@ -64,7 +64,7 @@ def fitted(
     if fit is None or belief.published is None:
         return Fitted(belief)
     part = record.swapped(kept.swapped - swapped).between(kept.first, belief.end)
-    run = setup.problem(part, kept.older, kept.start).at(fit)
+    run = setup.problem(part, kept.older).at(fit)
     newest = slice(-min(len(part.v), 4 * setup.family.memory, ROWS), None)
     u, y = run.u[newest], part.y[newest]
     place = Place(float(run.p[-1]), u, y, model, state_after(model, u, y))

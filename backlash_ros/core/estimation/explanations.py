@@ -13,15 +13,9 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Bounds
 from backlash_ros.core.estimation import settings
-from backlash_ros.core.estimation.fit import (
-    FEW_STEPS,
-    FIRST_STEPS,
-    Problem,
-    with_intervals,
-    with_walk,
-)
+from backlash_ros.core.estimation.fit import FEW_STEPS, FIRST_STEPS, Problem
 from backlash_ros.core.estimation.plant_family import PlantFamily
-from backlash_ros.core.estimation.posterior import Prior, Start, WindowFit
+from backlash_ros.core.estimation.posterior import Prior, WindowFit
 from backlash_ros.core.estimation.search import search
 from backlash_ros.core.law import OutOfBounds
 from backlash_ros.core.plant.backlash import engaged, play, reversals
@@ -47,10 +41,8 @@ class Setup:
     def __post_init__(self) -> None:
         object.__setattr__(self, 'noise_std', max(self.noise_std, 1e-12))
 
-    def problem(
-        self, record: Window, older: Prior | None = None, start: Start | None = None,
-    ) -> Problem:
-        return Problem(self.family, record.v, record.y, self.noise_std, older, start)
+    def problem(self, record: Window, older: Prior | None = None) -> Problem:
+        return Problem(self.family, record.v, record.y, self.noise_std, older)
 
     def is_known(self, f: WindowFit, turns: int | None = None) -> bool:
         """Whether m and the gap are known well enough to be published, and within their bounds.
@@ -194,8 +186,8 @@ def afresh(
     best = max(fits, key=lambda f: f.evidence)
     if best.m < 0.0 or hopeless:
         return best
-    best = mixed(p, with_intervals(p, best), fits)
-    return with_walk(p, best, setup.walk_std) if walks else best
+    best = mixed(p, p.with_intervals(best), fits)
+    return p.with_walk(best, setup.walk_std) if walks else best
 
 
 def mixed(p: Problem, best: WindowFit, others: Sequence[WindowFit] = ()) -> WindowFit:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from math import inf, isfinite, log, sqrt
+from math import inf, isfinite, isnan, log, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,10 +29,9 @@ STEPS, FIRST_STEPS, FEW_STEPS = 16, 6, 3  # of Gauss-Newton, at most
 
 @dataclass(frozen=True)
 class Run:
-    """A record by the values of a fit: G as b / a; p, u, y and what readings are off, all (N,).
+    """A record by the values of a fit: G as b / a; p, u, y (N,).
 
-    error: 0 where y was lost. weights: how much of an independent reading each one is (N,).
-    begins: where each of these begins among those that are known.
+    error: of the readings (N,), 0 where y was lost. weights, begins: as `independence` has them.
     """
 
     fit: WindowFit
@@ -53,16 +52,16 @@ class Run:
 class Problem:
     """A record v, y (N,), y nan where lost, with what is known beside it.
 
-    noise_std: nominal, a weak prior. older: what samples before the record say. start: where the
-    play rests, None where unknown. step: of the readings, None to be told from them.
+    noise_std: nominal, a weak prior. older: what samples before the record say. step: of the
+    readings, None to be told from them.
     """
 
     def __init__(
         self, family: Family, v: Array, y: Array, noise_std: float, older: Prior | None = None,
-        start: posterior.Start | None = None, step: float | None = None,
+        step: float | None = None,
     ) -> None:
         self.family, self.v, self.nominal = family, v, noise_std
-        self.older, self.start = older, start
+        self.older = older or Prior(np.zeros((0, 3 + family.count)), np.zeros(0))
         self.known = np.isfinite(y)
         self.y = np.where(self.known, y, 0.0)
         self.step_of_readings = posterior.step_of(y) if step is None else step
@@ -108,17 +107,13 @@ class Problem:
         return self._walk, knots, f.walk_std * sqrt(len(self.v) / len(self._walk))
 
     def log_posterior(self, f: WindowFit, w: Array | None = None) -> float:
-        """Of these values but for constants; -inf where it is no number.
-
-        w: weights of the readings (N,), the same for all that are compared; None: those of f.
-        """
+        """Of these values; w: weights of the readings (N,), None for those of f. -inf for nan."""
         leak, xi = f.theta[3:3 + self.family.leaks], f.theta[3 + self.family.leaks:]
         with np.errstate(all='ignore'):
             run = self.at(f)
             w = run.weights if w is None else w
             squares = float(xi @ xi) / f.scale**2 + float(leak @ leak)
-            if self.older is not None:
-                squares += float(np.sum((self.older.rows @ f.theta - self.older.values) ** 2))
+            squares += float(np.sum((self.older.rows @ f.theta - self.older.values) ** 2))
             value = -0.5 * (squares + log(f.scale) ** 2) - len(xi) * log(f.scale)
             if f.step:
                 value += float(w @ run.likelihood.log_density)
@@ -164,7 +159,7 @@ class Problem:
         _, knots, knot_std = self._walk_of(f)
         return replace(
             f, x=beta[:order], knots=beta[order:at - 1], theta=beta[at:],
-            p0=p0 if self.start is not None else min(max(p0, first), first + gap),
+            p0=min(max(p0, first), first + gap) if isnan(self.older.v) else p0,
             scale=scale, cov=cov[at:, at:], volume=volume - len(knots) * log(knot_std),
         )
 
@@ -175,16 +170,13 @@ class Problem:
         return Prior(r[at:-1, at:-1], r[at:-1, -1])
 
     def _triangle(self, f: WindowFit, held: bool, begun: bool) -> Array:
-        """R of the rows of a step, (P + 1, P + 1)."""
         from scipy.linalg.lapack import dgeqrf  # as above
 
         rows = self.rows(f, held, begun)
         return np.asarray(np.triu(dgeqrf(rows, overwrite_a=1)[0][:rows.shape[1]]))
 
     def rows(self, f: WindowFit, held: bool = False, begun: bool = False) -> Array:
-        """The least squares of a step: a row for each sample, then those of what is known beside.
-
-        Readings have deviation 1 in it, the target is the last column: shape (N + B, P + 1).
+        """The least squares of a step (N + B, P + 1): samples, what is known beside; target last.
         """
         vague = 100.0  # prior deviation of the state before a record, over the largest reading
         tight = 1e6  # weight of what is held
@@ -196,9 +188,9 @@ class Problem:
         of_samples *= np.sqrt(information * run.weights)
         at, last_knot = len(x) + len(knots) + 1, len(x) + len(knots) - 1  # at: place of m
         *unit, target = np.eye(len(beta) + 1)
-        p0, gap = unit[at - 1], unit[at + 2]
-        begin = tight * (p0 - self.start.left * gap + self.start.v * target) if self.start \
-            else sqrt(12.0) / max(f.gap, 1e-9) * (p0 + (first + 0.5 * f.gap) * target)
+        p0, gap, older = unit[at - 1], unit[at + 2], self.older
+        begin = sqrt(12.0) / max(f.gap, 1e-9) * (p0 + (first + 0.5 * f.gap) * target) \
+            if isnan(older.v) else tight * (p0 - older.left * gap + older.v * target)
         beside = [
             # The gap is within the swing; p0 is anywhere within the gap of now.
             tight * (gap + f.gap * target) if held else gap / max(float(np.ptp(self.v)), 1e-300),
@@ -209,9 +201,7 @@ class Problem:
             *((unit[k] - (k < last_knot) * unit[k + 1]) / knot_std
               for k in range(len(x), last_knot + 1)),
         ]
-        if self.older is not None:
-            before = np.zeros((len(self.older.rows), at))
-            beside.extend(np.column_stack([before, self.older.rows, self.older.values]))
+        beside.extend(np.column_stack([np.zeros((len(older.rows), at)), older.rows, older.values]))
         return np.hstack([of_samples, np.array(beside).T]).T
 
     def normalised(self, f: WindowFit) -> Array:
@@ -266,7 +256,6 @@ class Problem:
     def _stepped(
         self, f: WindowFit, best: float, weights: Array, most_scale: float, begun: bool = False,
     ) -> tuple[WindowFit, WindowFit, float]:
-        """What a step leads to, where it goes as far as that helps, and its log-posterior."""
         shortest_step = 0.05  # share of a Gauss-Newton step that is tried
         new = self.step(f, most_scale, begun=begun)
         there = self._towards(f, new)
@@ -319,7 +308,7 @@ class Problem:
         return replace(f, left=posterior.Left(value, rms, rho, count, turns))
 
     def begun(self, f: WindowFit, offset: bool = False) -> WindowFit:
-        """The same with the state before the record, and o if that is asked, at their best."""
+        """The same with the state before the record, and o where `offset`, at their best."""
         there = replace(f, x=np.zeros(1))
         run, of_o = self.at(there), -2 - self.family.count
         unknown = [*range(len(run.a) - 1), *[of_o] * offset]
@@ -329,53 +318,52 @@ class Problem:
         theta[1] += best[-1] * offset
         return replace(f, x=best[:len(run.a) - 1], theta=theta)
 
+    def with_intervals(self, f: WindowFit) -> WindowFit:
+        """The finished fit, by intervals where readings have a step that the noise does not hide.
 
-def with_intervals(p: Problem, f: WindowFit) -> WindowFit:
-    """The finished fit, by intervals where readings have a step that the noise does not hide.
+        The noise beside the rounding is the likeliest of a grid, but as large as leaves a reading
+        near an edge of its interval for every unknown: fewer are no normal posterior.
+        """
+        step, unknowns = self.step_of_readings, len(f.x) + len(f.knots) + 1 + len(f.theta)
+        largest = 0.25 * step
+        edges = unknowns / max(float(self.at(f).weights.sum()), 1.0)
+        least = min(step * max(1.0 / 64.0, edges), largest)
+        if not step or f.m <= 0.0 or (not f.step and f.noise_std > 0.75 * step):
+            return self.finished(f)
 
-    The noise beside the rounding is the likeliest of a grid, but as large as leaves a
-    reading near an edge of its interval for every unknown: fewer are no normal posterior.
-    """
-    step, unknowns = p.step_of_readings, len(f.x) + len(f.knots) + 1 + len(f.theta)
-    largest = 0.25 * step
-    edges = unknowns / max(float(p.at(f).weights.sum()), 1.0)
-    least = min(step * max(1.0 / 64.0, edges), largest)
-    if not step or f.m <= 0.0 or (not f.step and f.noise_std > 0.75 * step):
-        return p.finished(f)
+        def at(level: float, begin: WindowFit) -> WindowFit:
+            return self.finished(self.fitted(replace(begin, step=step, noise_std=level), FEW_STEPS))
 
-    def at(level: float, begin: WindowFit) -> WindowFit:
-        return p.finished(p.fitted(replace(begin, step=step, noise_std=level), FEW_STEPS))
-
-    first = max(min(f.noise_std if f.step else largest, largest), least)
-    best = at(first, f)
-    for factor in (0.5, 2.0):
-        if best.noise_std < first:
-            break
-        while least <= factor * best.noise_std <= largest:
-            other = at(factor * best.noise_std, best)
-            if other.evidence <= best.evidence:
+        first = max(min(f.noise_std if f.step else largest, largest), least)
+        best = at(first, f)
+        for factor in (0.5, 2.0):
+            if best.noise_std < first:
                 break
-            best = other
-    return best if best.left.rms < 1.5 * f.noise else p.finished(p.fitted(f.without_intervals))
+            while least <= factor * best.noise_std <= largest:
+                other = at(factor * best.noise_std, best)
+                if other.evidence <= best.evidence:
+                    break
+                best = other
+        if best.left.rms < 1.5 * f.noise:
+            return best
+        return self.finished(self.fitted(f.without_intervals))
 
+    def with_walk(self, f: WindowFit, least: float) -> WindowFit:
+        """The fit, or one where u walks as well if that explains why residuals are correlated.
 
-def with_walk(p: Problem, f: WindowFit, least: float) -> WindowFit:
-    """The fit, or one where u walks as well if that explains why residuals are correlated.
-
-    One that walks already is compared with one that does not in the same way. least: walk that is
-    configured, per square root of a sample.
-    """
-    best, begin = f, replace(f.without_intervals, knots=np.zeros(0), walk_std=least)
-    if f.walk_std != least:
-        best = with_intervals(p, p.fitted(begin))
-    if not best.valid or not best.systematic:
+        least: walk that is configured, per square root of a sample.
+        """
+        best, begin = f, replace(f.without_intervals, knots=np.zeros(0), walk_std=least)
+        if f.walk_std != least:
+            best = self.with_intervals(self.fitted(begin))
+        if not best.valid or not best.systematic:
+            return best
+        for share in (0.005, 0.02, 0.08):  # of m times the gap, by which u may walk over the record
+            walk_std = share * f.m * f.gap / sqrt(len(self.v))
+            if walk_std > least:
+                g = self.with_intervals(self.fitted(replace(begin, walk_std=walk_std), FIRST_STEPS))
+                needed = 0.0 if best.walk_std > least else settings.FAR_BEHIND
+                # Readings of which the walk leaves a correlated rest count as fewer.
+                if g.valid and g.evidence - best.evidence > needed * g.inflation:
+                    best = g
         return best
-    for share in (0.005, 0.02, 0.08):  # of m times the gap, by which u may walk over the record
-        walk_std = share * f.m * f.gap / sqrt(len(p.v))
-        if walk_std > least:
-            g = with_intervals(p, p.fitted(replace(begin, walk_std=walk_std), FIRST_STEPS))
-            needed = 0.0 if best.walk_std > least else settings.FAR_BEHIND
-            # Readings of which the walk leaves a correlated rest count as fewer.
-            if g.valid and g.evidence - best.evidence > needed * g.inflation:
-                best = g
-    return best

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from math import log, pi, sqrt
+from math import inf, log, nan, pi, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -58,7 +58,6 @@ def likelihood(r: Array, noise_std: float, step: float) -> Likelihood:
 
 
 def _of_interval(r: Array, half: float) -> tuple[Array, Array, Array]:
-    """Log of the probability of a step of 2 half [noise], its slope by the output, - curvature."""
     from scipy.special import log_ndtr  # where fits are made: 31 MB
 
     upper, lower = r + half, r - half
@@ -99,30 +98,25 @@ def independence(
 
 
 class Prior(NamedTuple):
-    """What older samples say: R theta = d + noise of deviation 1, shapes (r, 3 + K), (r,)."""
+    """What older samples say: R theta = d + noise of deviation 1, shapes (r, 3 + K), (r,).
+
+    v: at the last engagement, nan where it is unknown; left: on which side that was.
+    """
 
     rows: Array
     values: Array
-
-
-class Start(NamedTuple):
-    """Where the play rests before a record: v at the last engagement, and on which side."""
-
-    v: float
-    left: bool
+    v: float = nan
+    left: bool = False
 
 
 class Left(NamedTuple):
-    """What a fit leaves: log-likelihood and rms of its residuals, and correlation rho of them.
+    """What a fit leaves: of its residuals, or of the engaged side in the record."""
 
-    readings: independent ones. turns: reversals of the engaged side in the record.
-    """
-
-    likelihood: float = -np.inf
-    rms: float = np.inf
+    likelihood: float = -inf  # log
+    rms: float = inf
     correlation: float = 0.0
-    readings: float = 0.0
-    turns: int = 0
+    readings: float = 0.0  # independent ones
+    turns: int = 0  # reversals
 
 
 @dataclass(frozen=True)

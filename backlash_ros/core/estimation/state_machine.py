@@ -14,6 +14,8 @@
 
 from __future__ import annotations
 
+from math import isnan
+
 import numpy as np
 
 from backlash_ros.core.estimate import Status
@@ -27,7 +29,7 @@ from backlash_ros.core.estimation.belief import (
     shortened,
 )
 from backlash_ros.core.estimation.explanations import Setup, Window, afresh, mixed, outliers
-from backlash_ros.core.estimation.fit import FEW_STEPS, Problem, with_intervals, with_walk
+from backlash_ros.core.estimation.fit import FEW_STEPS, Problem
 from backlash_ros.core.estimation.posterior import WindowFit
 from backlash_ros.core.estimation.score_tests import coasts, likelier
 from backlash_ros.core.estimation.settings import BLOCKS, FEWEST, MISFIT, PREDICTED, SHORT_RECORD
@@ -52,7 +54,7 @@ def _begun_anew(before: Belief, first: int, end: int, next_at: int) -> Belief:
     return before._replace(
         reason=before.reason if before.fit is None else Status.INCONSISTENT, fit=None,
         found=None, doubt_from=None, end=end, next_at=next_at,
-        kept=before.kept._replace(first=first, older=None, start=None),
+        kept=before.kept._replace(first=first, older=None),
     )
 
 
@@ -98,7 +100,7 @@ def _searching(setup: Setup, record: Window, before: Belief) -> Belief:
     # What leaves more than noise must predict a quarter as many samples before it is believed.
     more = found.systematic or setup.noisier(found)
     trial = before.trial._replace(must=max(before.trial.must, len(part.v) // 4 if more else 0))
-    kept = after.kept._replace(older=None, start=None)
+    kept = after.kept._replace(older=None)
     return _adopted(setup, part, found, after._replace(kept=kept, trial=trial))
 
 
@@ -143,7 +145,7 @@ def _adopted(setup: Setup, record: Window, fit: WindowFit, before: Belief) -> Be
         must = min(must, PREDICTED)  # another noise, or a walk, but not another backlash
     return published(setup, before._replace(
         found=None, doubt_from=None, end=record.end,
-        coasts=coasts(setup.problem(record, kept.older, kept.start), fit),
+        coasts=coasts(setup.problem(record, kept.older), fit),
         kept=kept._replace(first=record.first), trial=Trial(must, 0, fit.noise),
         next_at=record.end + max(count // BLOCKS, FEWEST),
         thorough=Look(record.end + count // 4, 0.5 * fit.gap_std),
@@ -154,13 +156,13 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
     held, trial, kept = before.fit, before.trial, before.kept
     assert held is not None
     count, new = len(record.v), before.end - record.first
-    problem = setup.problem(record, kept.older, kept.start)
+    problem = setup.problem(record, kept.older)
     fit = problem.fitted(held, FEW_STEPS)
     since = before.end - setup.family.memory
     record, others = likelier(problem, fit, record, since, kept.swapped)
     if others != kept.swapped:
         kept = kept._replace(swapped=others)
-        problem = setup.problem(record, kept.older, kept.start)
+        problem = setup.problem(record, kept.older)
         fit = problem.fitted(fit, FEW_STEPS)
     wild = outliers(problem.residual(fit)[new:] / held.noise)
     if wild.any():
@@ -189,14 +191,14 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
     )
     narrow = fit.gap_std < before.thorough.gap_std and count <= SHORT_RECORD
     if narrow or record.end >= before.thorough.at:
-        fit, other = with_intervals(problem, fit), None
-        short = count <= SHORT_RECORD and kept.start is None
+        fit, other = problem.with_intervals(fit), None
+        short = count <= SHORT_RECORD and isnan(problem.older.v)
         if short:
             other = afresh(setup, record, None if kept.older is None else fit, kept.older)
         if short or fit.spread.any():  # else it has been normal for long
             known = other is not None and setup.is_known(other, settings.REVERSALS)
             fit = mixed(problem, fit, [other] if other is not None and known else [])
-        fit = with_walk(problem, fit, setup.walk_std)
+        fit = problem.with_walk(fit, setup.walk_std)
         after = after._replace(
             thorough=Look(record.end + 2 * count // 5, 0.5 * fit.gap_std))
     else:
@@ -241,7 +243,7 @@ def _doubted(setup: Setup, record: Window, before: Belief) -> Belief:
     count, newer = len(record.v), record.end - since
     after = before._replace(end=record.end, found=None,
                     next_at=record.end + max(newer // 4, FEWEST))
-    z = setup.problem(record, kept.older, kept.start).residual(held) / held.noise
+    z = setup.problem(record, kept.older).residual(held) / held.noise
     if newer >= 2 * PREDICTED and np.nanmean(z[-PREDICTED:] ** 2) < MISFIT:
         # Whatever it was, it is over: what was measured meanwhile says nothing.
         lost = frozenset(range(since, record.end - PREDICTED))
@@ -270,10 +272,10 @@ def _doubted(setup: Setup, record: Window, before: Belief) -> Belief:
         if before.found is None or not before.found.alike(found):
             return after._replace(found=found)
         return _adopted(setup, part, found, after._replace(kept=kept._replace(
-            first=0, older=held.prior_of_xi, start=None)))
+            first=0, older=held.prior_of_xi)))
     if whole is not None and setup.is_known(whole):
         return _adopted(setup, record, whole, after._replace(
-            kept=kept._replace(older=None, start=None)))
+            kept=kept._replace(older=None)))
     # Two reversals of the record take so long, on average.
     if newer > max(short, 2 * count // max(held.left.turns, 1)):
         return _begun_anew(after, since, record.end, record.end + 1)
