@@ -1,7 +1,5 @@
 """What is believed of the backlash, what is published of it, and what older samples leave of it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from enum import Enum, auto
 from math import inf, nan, sqrt

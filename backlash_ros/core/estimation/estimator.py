@@ -5,8 +5,6 @@ state of G at once (C. V. Rao, J. B. Rawlings, D. Q. Mayne, Constrained state es
 nonlinear discrete-time systems, IEEE Trans. Automatic Control 48 (2003) 246-258).
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from math import hypot, nan
 from typing import NamedTuple
@@ -15,17 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Bounds, Estimate, Status
+from backlash_ros.core.estimation import settings
 from backlash_ros.core.estimation.belief import Belief, Kept, Known
 from backlash_ros.core.estimation.explanations import Setup, Window
 from backlash_ros.core.estimation.observer import Following, Place, state_after
 from backlash_ros.core.estimation.plant_family import PlantFamily
-from backlash_ros.core.estimation.settings import (
-    FEWEST,
-    FIRST_FIT,
-    HELD_REVERSALS,
-    LONGEST,
-    ROWS,
-)
 from backlash_ros.core.estimation.state_machine import learn
 from backlash_ros.core.jobs import ChannelSamples, Executor, Failure
 from backlash_ros.core.law import Interval, Law, LawReport
@@ -34,19 +26,12 @@ from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.transfer_function import Array, StateModel, TransferFunction
 
 
-class Proposal(NamedTuple):
-    """A G that was learned, and its xi (K,): () where it is not to be learned again."""
-
-    model: StateModel
-    xi: Array
-
-
 class Fitted(NamedTuple):
     """What comes of a fit: what is believed, where play and G stand, a better G if there is one."""
 
     belief: Belief
     place: Place | None = None
-    proposal: Proposal | None = None
+    better: StateModel | None = None
 
 
 def fitted(
@@ -54,39 +39,35 @@ def fitted(
 ) -> Fitted:
     """What is believed with these samples: the job that is done beside the loop.
 
-    model: the G whose state the structure wants. proposed: xi (K,) of the newest proposal.
+    model: the G whose state the structure wants. proposed: xi (K,) of the newest proposal, () where
+    G is not to be learned.
     """
     swapped = before.kept.swapped
     record = Window(samples.first, *samples.columns).swapped(swapped)
-    first = max(before.kept.first, record.end - LONGEST)
+    first = max(before.kept.first, record.end - settings.LONGEST)
     belief = learn(setup, record.between(first), before)
     fit, kept = belief.fit, belief.kept
     if fit is None or belief.published is None:
         return Fitted(belief)
     part = record.swapped(kept.swapped - swapped).between(kept.first, belief.end)
     run = setup.problem(part, kept.older).at(fit)
-    newest = slice(-min(len(part.v), 4 * setup.family.memory, ROWS), None)
+    newest = slice(-min(len(part.v), 4 * setup.family.memory, settings.ROWS), None)
     u, y = run.u[newest], part.y[newest]
     place = Place(float(run.p[-1]), u, y, model, state_after(model, u, y))
-    if not len(proposed) or not belief.trusted or fit.behind(proposed) <= 1.0:
-        return Fitted(belief, place)
-    return Fitted(
-        belief, place, Proposal(StateModel(setup.family.model_at(fit.xi)), fit.theta[3:]))
+    off = len(proposed) and belief.trusted and fit.behind(proposed) > 1.0
+    return Fitted(belief, place, StateModel(setup.family.model_at(fit.xi)) if off else None)
 
 
 class MovingHorizon(Law):
     """Learns (m, c_r, c_l) and the error of G from y alone.
 
-    initial: a first guess, or with its deviations what was learned before. uncertainty: relative
-    spread of the time constants, damping and delay of the nominal G, 0 where it is exact. walk_std,
-    drift_std: random walks of u and of m, c_r, c_l, per square root of a second; a walk_std of 0 is
-    learned where the samples demand a walk. observer: gives the state of G until the backlash is
+    initial: a first guess, or with its deviations what was learned before. uncertainty: relative,
+    of the frequencies, damping and delay of G. walk_std, drift_std: random walks of u and of m,
+    c_r, c_l, per square root of a second. observer: gives the state of G until the backlash is
     known, for structures that want it.
     """
 
-    RETUNED = (
-        'estimator.output_noise_std', 'estimator.input_noise_std', 'estimator.drift_std',
-    )
+    RETUNED = 'estimator.output_noise_std', 'estimator.input_noise_std', 'estimator.drift_std'
 
     def __init__(
         self, initial: Estimate, bounds: Bounds, model: StateModel, noise_std: float,
@@ -100,17 +81,17 @@ class MovingHorizon(Law):
             family, noise_std, bounds, bounds.c_r[1] - bounds.c_l[0], initial.c_r - initial.c_l,
             walk_std * root, np.array(drift_std) * root,
         )
-        self._channel = (executor or Executor()).open(3, LONGEST + 16_384)
+        self._channel = (executor or Executor()).open(3, settings.LONGEST + 16_384)
         self._belief = Belief()
         if initial.learned:
             std = np.array([initial.std_m, initial.std_c_r, initial.std_c_l])
             known = Known(np.array([initial.m, initial.c_r, initial.c_l]), np.diag(std**2))
             self._belief = Belief(inherited=known, published=known)
         self._following = Following(model, observer)
-        self._proposal = Proposal(model, np.zeros(0 if initial.learned else family.count))
+        self._proposed = model
+        self._xi: Array = np.zeros(0 if initial.learned else family.count)  # of that G
         self._recording = True  # whether the newest sample was one to learn from
-        self._lost_in_a_row = self._failed_fits = 0
-        self._reattributed = 0  # intervals so far over which the other command acted
+        self._lost_in_a_row = self._failed_fits = self._reattributed = 0
         self._skipping_fit = False  # whether the fit under way is of a record that was given up
 
     @property
@@ -132,12 +113,11 @@ class MovingHorizon(Law):
 
     @property
     def proposal(self) -> StateModel | None:
-        proposed = self._proposal.model
-        return None if proposed is self._following.model else proposed
+        return None if self._proposed is self._following.model else self._proposed
 
     @property
     def learned_model(self) -> StateModel:
-        return self._proposal.model
+        return self._proposed
 
     @property
     def report(self) -> LawReport:
@@ -152,7 +132,7 @@ class MovingHorizon(Law):
             coasts=belief.coasts,
             wrong_sign=found is not None and found.m < 0.0,
             undecided=belief.published is None and found is not None and found.m > 0.0
-            and found.left.turns >= HELD_REVERSALS,
+            and found.left.turns >= settings.HELD_REVERSALS,
             forbidden=outside[0] if outside else None,
             waiting=self._channel.record.end - belief.end,
             outliers=self._following.outliers,
@@ -186,8 +166,8 @@ class MovingHorizon(Law):
             # Another record: the samples before it are not those before the next one.
             before, end = self._belief, self._channel.record.end
             self._belief = Belief(
-                kept=Kept(first=end), end=end, next_at=end + FIRST_FIT, published=before.published,
-                inherited=before.inherited or before.published,
+                kept=Kept(first=end), end=end, next_at=end + settings.FIRST_FIT,
+                published=before.published, inherited=before.inherited or before.published,
             )
             self._skipping_fit = self._channel.busy
         self._recording = self.adapting
@@ -216,7 +196,7 @@ class MovingHorizon(Law):
             return
         following.beyond += following.surprised  # once
         channel.submit(
-            fitted, setup, self._belief, following.model.transfer_function, self._proposal.xi,
+            fitted, setup, self._belief, following.model.transfer_function, self._xi,
             since=self._belief.kept.first,
         )
         self._take(channel.poll())
@@ -230,7 +210,7 @@ class MovingHorizon(Law):
             return
         if isinstance(result, Failure):
             self._failed_fits += 1
-            self._belief = self._belief._replace(next_at=self._channel.record.end + FEWEST)
+            self._belief = self._belief._replace(next_at=self._channel.record.end + settings.FEWEST)
             return
         before, belief, following = self._belief, result.belief, self._following
         self._belief, place, fit = belief, result.place, belief.fit
@@ -238,10 +218,11 @@ class MovingHorizon(Law):
         if belief.published is not None and (
             belief.published is not before.published or belief.coasts is not before.coasts
         ):
-            self._publish(belief.published)
-        self._proposal = result.proposal or self._proposal
+            self.estimate = self._estimate_of(belief, belief.published)
         if place is None or fit is None:
             return
+        if result.better is not None:
+            self._proposed, self._xi = result.better, fit.theta[3:]
         if not belief.trusted and following.observer is not None:
             following.observer.settle(fit.noise)  # no fit says where the state is
             return
@@ -249,14 +230,13 @@ class MovingHorizon(Law):
         newer = record.between(belief.end, record.end).columns[:2]
         following.go_on_from(place, newer, self.estimate, fit.noise, belief.trusted)
 
-    def _publish(self, known: Known) -> None:
-        m, c_r, c_l = self._setup.bounds.project(*known.crossings.tolist())
+    def _estimate_of(self, belief: Belief, known: Known) -> Estimate:
+        values, e = self._setup.bounds.project(*known.crossings.tolist()), self.estimate
         std_m, std_c_r, std_c_l = np.sqrt(np.maximum(np.diag(known.cov), 0.0)).tolist()
-        fit = self._belief.fit or self._belief.found
-        if self._belief.coasts and fit is not None:
+        fit = belief.fit or belief.found
+        if belief.coasts and fit is not None:
             # Motion of the load within the gap makes the gap doubtful: a structure that shrinks it
             # by its deviations pushes the load less. A fit of its own may have next to no gap.
             doubt = 0.5 * fit.unexplained * fit.gap
             std_c_r, std_c_l = hypot(std_c_r, doubt), hypot(std_c_l, doubt)
-        e = self.estimate
-        self.estimate = Estimate(m, c_r, c_l, e.f, std_m, std_c_r, std_c_l, e.status)
+        return Estimate(*values, e.f, std_m, std_c_r, std_c_l, e.status)

@@ -8,8 +8,6 @@ Gamma) over a grid of s, whose prior is log-normal around 1: G is about as wrong
 derivatives by g and p0 are 1 where the left side was engaged last, and where none was.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import inf, isfinite, isnan, log, sqrt

@@ -92,13 +92,11 @@ class Observer:
 
     @property
     def state(self) -> list[float]:
-        """x in the coordinates of StateModel, n values."""
+        """x in the coordinates of StateModel."""
         return [sum(map(mul, row, self._x)) for row in self._to_state]
 
     def place(self, x: Array, known: bool) -> None:
-        """Go on from the state x in the observer form.
-
-        known: whether it is known better than by the newest samples, which are to move it little.
+        """Go on from the state x in the observer form, which newer samples move little if `known`.
         """
         self._x[:] = x.tolist()
         if known:
@@ -151,10 +149,9 @@ class Following:
     """Follows play operator and state of G from sample to sample.
 
     model: G of the structure that asks for the state. before: gives the state until a backlash is
-    known. observer: that does so from then on. u: before the newest y; nan before a backlash is
-    known. innovation: of the newest y. since_motion: samples since p, or v before a backlash is
-    known, moved. outliers: readings that did not move the state. beyond: as many in a row, and
-    those after them.
+    known, observer: from then on. u: before the newest y, nan until then. since_motion: samples
+    since p moved, v until then. outliers: readings that did not move the state. beyond: as many in
+    a row, and those after them.
     """
 
     def __init__(self, model: StateModel, before: FixedBacklash | None) -> None:
@@ -212,7 +209,6 @@ class Following:
         self.since_motion = self.since_motion + 1 if self._p == p else 0
 
     def _advance(self, v: float, y: float, estimate: Estimate) -> None:
-        """Take the play over v, and keep u and y, nan where it was lost."""
         self._p = p = clamp(self._p, v, v + estimate.c_r - estimate.c_l)
         self.u = u = estimate.m * (p - estimate.c_r)
         self._u.append(u)
@@ -223,8 +219,8 @@ class Following:
     ) -> None:
         """Let play and observer stand where a fit says that they stood, and step to now.
 
-        newer: v and y of the samples since then (2, M). known: whether the fit explains all of its
-        samples, so that it knows the state better than the newest of them do.
+        newer: v and y of the samples since then (2, M). known: whether the fit knows the state
+        better than the newest samples do.
         """
         own, other = self.model.transfer_function, place.model
         follows = np.array_equal(other.denominator, own.denominator) \

@@ -3,16 +3,12 @@
     G(z; xi) = z^-d [B (1 - f + f z^-1) + xi_w w (1 - z^-1)^2 B'] A(1)/A_nominal(1) / (A I)
 
 xi (K,), in units of prior deviations: where G integrates, the leak of an integrator; the lag (d + f
-samples beside the nominal delay, d whole); the width of the response; ln Omega, ln D of every
-section s^2 + 2 D Omega s + Omega^2 of two poles (a real pair is D >= 1, so that there is no edge);
-ln of a single real pole. Poles at 0, on the negative axis or outside of the unit circle stay.
-
-What acts a part t of a sample late has the lag t and the width -t (1 - t) / 2: B' is B one sample
-shorter, and w = 1/8 the widest. With two poles, lag and width make every numerator that a dead time
-or another Omega can give.
+samples beside the nominal delay, d whole); the width of the response, w = 1/8 at most, B' = B one
+sample shorter; ln Omega, ln D of every section s^2 + 2 D Omega s + Omega^2 of two poles (a real
+pair is D >= 1, so that there is no edge); ln of a single real pole. What acts a part t of a sample
+late has the lag t and the width -t (1 - t) / 2. Poles at 0, on the negative axis or outside of the
+unit circle stay.
 """
-
-from __future__ import annotations
 
 from cmath import cos, exp, sqrt
 from collections.abc import Sequence
@@ -166,7 +162,7 @@ def sensitivities(family: Family, xi: list[float], u: Array, y: Array) -> Array:
 
 
 def _sections(poles: NDArray[np.complex128]) -> tuple[int, list[float]]:
-    """Number of pairs, and ln Omega, ln D of each, then ln of a real pole that is left over."""
+    """Number of pairs; ln Omega, ln D of each, then ln of a real pole that is left over."""
     s = np.log(poles.astype(complex))
     pairs = [(abs(x), -x.real / abs(x)) for x in s if x.imag > 1e-9]
     real = sorted(-x.real for x in s if abs(x.imag) <= 1e-9)
@@ -178,7 +174,7 @@ def _sections(poles: NDArray[np.complex128]) -> tuple[int, list[float]]:
 
 
 def _product(*factors: Sequence[complex]) -> list[complex]:
-    """Coefficients of a product of polynomials: for so few, faster than np.convolve."""
+    """Of polynomials: for so few coefficients, faster than np.convolve."""
     product = [1.0 + 0j]
     for factor in factors:
         out = [0j] * (len(product) + len(factor) - 1)

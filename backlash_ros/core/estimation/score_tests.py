@@ -1,44 +1,33 @@
 """What a fit lacks, told from its residuals alone: a load that coasts, commands that were late.
 
-A load that nothing holds in the gap runs on with the speed that it had when it left its side, as
-far as the other side. That is one more column of the fit; its coefficient kappa is 0 where the load
-stays and 1 where nothing brakes it (C. R. Rao, Proc. Cambridge Philosophical Society 44 (1948)).
+A load that nothing holds in the gap runs on with the speed that it had when it left its side. That
+is one more column of the fit; its coefficient kappa is 0 where the load stays and 1 where nothing
+brakes it (C. R. Rao, Proc. Cambridge Philosophical Society 44 (1948)).
 
-Where the time of arrival leaves open which of two commands acted over an interval, the other one
-would add s to y, until the play output is the same again. With s in the residuals r, it is
-
-    (s.r - s.s / 2) / sigma^2
-
-more likely, less the log-odds against it; of both r and s, what other unknowns may explain is left
-out. The likeliest is believed first, and the rest compared again, until none is likely. How often
-commands are late is unknown: with Jeffreys' prior of that share, k of n that were late make the
-odds of one more (k + 1/2) to (n - k - 1/2) (A. S. Willsky, H. L. Jones, A generalized likelihood
-ratio approach to the detection and estimation of jumps, IEEE Trans. Automatic Control 21 (1976)).
+Where one of two commands may have acted over an interval, the other one would add s to y. With s in
+the residuals r, it is (s.r - s.s / 2) / sigma^2 more likely, less the log-odds against it; of both,
+what other unknowns may explain is left out. The likeliest is believed first, until none is likely.
+By Jeffreys' prior of the share of late ones, k of n that were late make the odds of one more (k +
+1/2) to (n - k - 1/2) (A. S. Willsky, H. L. Jones, IEEE Trans. Automatic Control 21 (1976)).
 """
-
-from __future__ import annotations
 
 from dataclasses import replace
 from math import log, sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.explanations import Window
 from backlash_ros.core.estimation.fit import Problem
 from backlash_ros.core.estimation.posterior import WindowFit
 from backlash_ros.core.plant.backlash import clamp, play
 from backlash_ros.core.plant.numerics import lfilter
-from backlash_ros.core.plant.transfer_function import ON_CIRCLE, memory_of
-
-Array = NDArray[np.float64]
+from backlash_ros.core.plant.transfer_function import ON_CIRCLE, Array, memory_of
 
 
 def coasts(problem: Problem, fit: WindowFit, known: Array | None = None) -> bool:
     """Whether residuals are correlated because the load runs on within the gap.
 
-    That is the gap of the fit, or the one `known` before: m, c_r, c_l (3,). The fit of a load that
-    coasts may have next to no gap.
+    known: m, c_r, c_l (3,) from before, for the fit of a load that coasts may have next to no gap.
     """
     if not (fit.m > 0.0 and fit.systematic):
         return False
@@ -54,8 +43,7 @@ def coasts(problem: Problem, fit: WindowFit, known: Array | None = None) -> bool
 
 def _runs_on(problem: Problem, fit: WindowFit) -> bool:
     v, p = problem.v, problem.at(fit).p
-    beyond = [0.0]  # how far a load that nothing brakes is from p
-    speed = 0.0
+    beyond, speed = [0.0], 0.0  # how far a load that nothing brakes is from p
     for k, move in enumerate(np.diff(p).tolist(), 1):
         speed = move or speed
         # From one side, where it starts anew, to the other.
@@ -73,12 +61,12 @@ def _runs_on(problem: Problem, fit: WindowFit) -> bool:
     return kappa > 0.15 and kappa * squares**0.5 / max(fit.noise, fit.left.rms) > 8.0
 
 
-def likelier(problem: Problem, fit: WindowFit, record: Window, since: int, back: frozenset[int],
-             ) -> tuple[Window, frozenset[int]]:
+def likelier(
+    problem: Problem, fit: WindowFit, record: Window, since: int, back: frozenset[int],
+) -> tuple[Window, frozenset[int]]:
     """The record as it is likelier from `since` on, and where in it the other command acted.
 
-    problem: of the record. back: numbers of the samples over which the other one acts already, so
-    that its odds are the reverse.
+    back: numbers of the samples over which the other one acts already: its odds are the reverse.
     """
     own_noise = 0.25  # of correlated residuals: what is noise of readings
     open_ = np.flatnonzero(np.isfinite(record.other))
@@ -99,7 +87,7 @@ def likelier(problem: Problem, fit: WindowFit, record: Window, since: int, back:
     swapped = before = np.isin(record.first + open_, list(back))
 
     def added(k: int) -> Array:
-        """To y, where the other command acts over interval k."""
+        """What y has more, where the other command acts over interval k."""
         acting = np.append(other[k], v[k + 1:k + reach])
         moved = play(acting, fit.gap, float(p[k - 1]) if k else fit.p0) - p[k:k + reach]
         return lfilter(b, a, fit.m * moved) * known[k:k + reach]
@@ -108,7 +96,6 @@ def likelier(problem: Problem, fit: WindowFit, record: Window, since: int, back:
     pulse, begin = lfilter(b, a, fit.m * (np.arange(reach) == 0.0)), open_[0]
 
     def sums(values: Array, weights: Array) -> Array:
-        """Sum of the values from each interval on (K,), so weighted."""
         padded = np.pad(values[begin:], (0, reach - 1))
         return np.asarray(np.correlate(padded, weights)[open_ - begin])
 

@@ -4,8 +4,6 @@ For a gap g and a beginning p0, y is linear in the state, o, m, m xi, and m time
 (to first order in both): one QR for each of some 200 hypotheses, over rows averaged to some 1,500.
 """
 
-from __future__ import annotations
-
 from math import inf, isfinite
 from typing import NamedTuple
 
@@ -79,11 +77,9 @@ class _Comparison:
         return np.asarray(np.add.reduceat(known, self._begins, axis=-1) * self._weights)
 
     def _without_common(self, columns: Array) -> Array:
-        """Columns (..., R) without what state and o explain."""
         return np.asarray(columns - (columns @ self._q) @ self._q.T)
 
     def evidence(self, gaps: Array) -> list[Hypothesis]:
-        """The best beginning of each gap."""
         shares: Array = np.arange(5) / 4.0  # places of the beginnings within the gap
         (b, a), k = self._family.at(self._xi), self._family.count
         g = np.repeat(gaps, len(shares))

@@ -3,8 +3,6 @@
 What is used once, as part of one formula, stands there by name; so do guards against rounding.
 """
 
-from __future__ import annotations
-
 # --- what counts as known
 STD_SLOPE = 0.2  # standard deviation of m over m, below which an estimate is published
 STD_GAP = 0.3  # that of gap and crossings over the gap: BY_CHANCE of them if residuals correlate

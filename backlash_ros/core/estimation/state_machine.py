@@ -12,8 +12,6 @@
 |           |                            |                      | long as a search looks          |
 """
 
-from __future__ import annotations
-
 from math import isnan
 
 import numpy as np
