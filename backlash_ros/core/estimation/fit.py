@@ -8,9 +8,10 @@ Gamma) over a grid of s, whose prior is log-normal around 1: G is about as wrong
 derivatives by g and p0 are 1 where the left side was engaged last, and where none was.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from math import inf, isfinite, isnan, log, sqrt
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,26 +26,21 @@ from backlash_ros.core.plant.transfer_function import Array
 STEPS, FIRST_STEPS, FEW_STEPS = 16, 6, 3  # of Gauss-Newton, at most
 
 
-@dataclass(frozen=True)
-class Run:
+class Run(NamedTuple):
     """A record by the values of a fit: G as b / a; p, u, y (N,).
 
     error: of the readings (N,), 0 where y was lost. weights, begins: as `independence` has them.
     """
 
-    fit: WindowFit
     b: list[float]
     a: list[float]
     p: Array
     u: Array
     y: Array
     error: Array
+    likelihood: posterior.Likelihood
     weights: Array
     begins: NDArray[np.intp]
-
-    @cached_property
-    def likelihood(self) -> posterior.Likelihood:
-        return posterior.likelihood(self.error, self.fit.noise_std, self.fit.step)
 
 
 class Problem:
@@ -63,27 +59,21 @@ class Problem:
         self.known = np.isfinite(y)
         self.y = np.where(self.known, y, 0.0)
         self.step_of_readings = posterior.step_of(y) if step is None else step
-        self._newest: list[Run] = []  # of which nothing is computed again
+        self._newest: dict[WindowFit, Run] = {}
 
     def at(self, f: WindowFit) -> Run:
         """The record by the values of this fit."""
-        for run in self._newest:
-            g = run.fit
-            if f.x is g.x and f.theta is g.theta and f.knots is g.knots and f.p0 == g.p0:
-                if (f.noise_std, f.step) == (g.noise_std, g.step):
-                    return run
-                run = replace(run, fit=f)
-                break
-        else:
+        if f not in self._newest:
             p = play(self.v, max(f.gap, 0.0), f.p0)
             hats, knots, _ = self._walk_of(f)
             u = f.m * p - f.theta[1] + knots @ hats
             b, a = self.family.at(f.xi)
             y = lfilter(b, a, u, padded(f.x, len(a) - 1))
-            run = Run(f, b, a, p, u, y, (self.y - y) * self.known, *posterior.independence(
-                self.y, self.known, y, self.step_of_readings))
-        self._newest = [run, *self._newest[:2]]
-        return run
+            error = (self.y - y) * self.known
+            run = Run(b, a, p, u, y, error, posterior.likelihood(error, f.noise_std, f.step),
+                      *posterior.independence(self.y, self.known, y, self.step_of_readings))
+            self._newest = dict([(f, run), *self._newest.items()][:3])
+        return self._newest[f]
 
     def residual(self, f: WindowFit) -> Array:
         """y minus what is expected (N,), nan where it was lost."""

@@ -119,7 +119,7 @@ class Left(NamedTuple):
     turns: int = 0  # reversals
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class WindowFit:
     """Values of all unknowns with their posterior.
 

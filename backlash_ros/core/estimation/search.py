@@ -36,68 +36,47 @@ def search(
     G is linearized. smallest: gap that is compared, over the swing of v.
     """
     none = 1e-9  # gap that counts as none, over the swing of v
-    swing = float(np.ptp(v))
-    top = min(swing, widest)
-    gaps: Array = np.append(none * swing, np.geomspace(smallest * min(swing, top), top, 32))
-    compared = _Comparison(family, v, y, noise_std, xi.tolist())
-    # Of so many at once that memory holds them.
-    parts = np.array_split(gaps, 1 + len(gaps) * len(v) * (1 + family.count) // 500_000)
-    found = [h for part in parts for h in compared.evidence(part) if isfinite(h.evidence)]
-    e = [-inf, *(h.evidence for h in found), -inf]
-    peaks = [h for k, h in enumerate(found) if e[k] < e[k + 1] > e[k + 2]]
-    first = sorted(peaks, reverse=True)[:3]
-    return [*first, *sorted({*found} - {*first}, reverse=True)], compared.null
+    known, begins, (b, a) = np.isfinite(y), _bins(v), family.at(xi.tolist())
+    readings = np.add.reduceat(known.astype(np.float64), begins)
+    weights = (readings > 0.0) / np.sqrt(np.maximum(readings, 1.0))
 
-
-class _Comparison:
-    """Gaps compared by one record. null: evidence of a u that never moves."""
-
-    def __init__(
-        self, family: Family, v: Array, y: Array, noise_std: float, xi: list[float],
-    ) -> None:
-        self._family, self._v, self._xi, self._nominal = family, v, xi, noise_std
-        self._known, self._begins = np.isfinite(y), _bins(v)
-        readings = np.add.reduceat(self._known.astype(np.float64), self._begins)
-        self._weights = (readings > 0.0) / np.sqrt(np.maximum(readings, 1.0))
-        b, a = family.at(xi)
-        common = np.vstack([state_columns(a, len(v)).T, lfilter(b, a, np.ones(len(v)))])
-        self._q = np.linalg.qr(self._averaged(common).T)[0]
-        self._y = self._without_common(self._averaged(np.where(self._known, y, 0.0)))
-        self._freedom = max(self._q.shape[0] - self._q.shape[1], 1)
-        self.null = float(self._value(self._y @ self._y))
-
-    def _value(self, squares: Array) -> Array:
-        """Evidence of what leaves these squares, noise integrated out."""
-        noise = (squares + self._nominal**2) / len(self._q)
-        return np.asarray(-0.5 * self._freedom * np.log(noise))
-
-    def _averaged(self, columns: Array) -> Array:
+    def averaged(columns: Array) -> Array:
         """Columns (..., N) summed over bins and divided by the root of the readings in each."""
-        known = columns * self._known
-        return np.asarray(np.add.reduceat(known, self._begins, axis=-1) * self._weights)
+        return np.asarray(np.add.reduceat(columns * known, begins, axis=-1) * weights)
 
-    def _without_common(self, columns: Array) -> Array:
-        return np.asarray(columns - (columns @ self._q) @ self._q.T)
+    common = np.vstack([state_columns(a, len(v)).T, lfilter(b, a, np.ones(len(v)))])
+    q = np.linalg.qr(averaged(common).T)[0]
+    freedom = max(q.shape[0] - q.shape[1], 1)
 
-    def evidence(self, gaps: Array) -> list[Hypothesis]:
+    def rest(columns: Array) -> Array:
+        """Columns (..., R) without what state and o explain."""
+        return np.asarray(columns - (columns @ q) @ q.T)
+
+    def value(squares: Array) -> Array:
+        """Evidence of what leaves these squares, noise integrated out."""
+        return np.asarray(-0.5 * freedom * np.log((squares + noise_std**2) / len(q)))
+
+    y_rest = rest(averaged(np.where(known, y, 0.0)))
+
+    def compared(gaps: Array) -> list[Hypothesis]:
+        """The best beginning of each gap."""
         shares: Array = np.arange(5) / 4.0  # places of the beginnings within the gap
-        (b, a), k = self._family.at(self._xi), self._family.count
-        g = np.repeat(gaps, len(shares))
-        begins = self._v[0] + np.tile(shares, len(gaps)) * g
-        p = play(self._v, g, begins)
+        g, k = np.repeat(gaps, len(shares)), family.count
+        before = v[0] + np.tile(shares, len(gaps)) * g
+        p = play(v, g, before)
         begun = np.logical_and.accumulate(p == p[:, :1], axis=1).astype(np.float64)
         # xi changes no constant part of u: that keeps to o.
         move = lfilter([1.0], a, p - p[:, :1])
         y_over_a = lfilter([1.0], a, lfilter(b, [1.0], move))
-        columns = self._without_common(np.concatenate([
-            self._averaged(lfilter(b, [1.0], lfilter([1.0], a, np.stack([p, begun], 1)))),
-            self._averaged(sensitivities(self._family, self._xi, move, y_over_a)),
+        columns = rest(np.concatenate([
+            averaged(lfilter(b, [1.0], lfilter([1.0], a, np.stack([p, begun], 1)))),
+            averaged(sensitivities(family, xi.tolist(), move, y_over_a)),
         ], axis=1))
-        y = np.broadcast_to(self._y, (len(g), 1, len(self._y)))
-        stack = np.concatenate([columns, y], axis=1).transpose(0, 2, 1)
+        target = np.broadcast_to(y_rest, (len(g), 1, len(y_rest)))
+        stack = np.concatenate([columns, target], axis=1).transpose(0, 2, 1)
         r = np.asarray(np.linalg.qr(stack, mode='r'))
         # In units of v.
-        noise = np.sqrt((r[:, -1, -1] ** 2 + self._nominal**2) / self._freedom) \
+        noise = np.sqrt((r[:, -1, -1] ** 2 + noise_std**2) / freedom) \
             / (np.abs(r[:, 0, -1] / r[:, 0, 0]) + 1e-30)
         evidence = np.full(len(g), -inf)
         for scale in (0.03, 0.3, 1.0) if k else (1.0,):  # of the error of G that are weighed
@@ -106,13 +85,22 @@ class _Comparison:
             of_prior = prior[:, :, None] * np.eye(1 + k, 3 + k, 1)
             s = np.asarray(np.linalg.qr(np.concatenate([r, of_prior], axis=1), mode='r'))
             volume = np.log(prior / (np.abs(np.diagonal(s, 0, 1, 2)[:, 1:-1]) + 1e-300)).sum(axis=1)
-            value = self._value(s[:, -1, -1] ** 2) + volume - 0.5 * scale**2
-            evidence = np.maximum(evidence, value)
+            evidence = np.maximum(evidence, value(s[:, -1, -1] ** 2) + volume - 0.5 * scale**2)
         off = s[:, 1, -1] / s[:, 1, 1]
         m = (s[:, 0, -1] - s[:, 0, 1] * off) / s[:, 0, 0]
-        p0 = np.clip(begins + off / m, self._v[0], self._v[0] + g)
+        p0 = np.clip(before + off / m, v[0], v[0] + g)
         best = evidence.reshape(len(gaps), -1).argmax(axis=1) + np.arange(0, len(g), len(shares))
         return [Hypothesis(*one) for one in np.column_stack([evidence, g, p0, m])[best].tolist()]
+
+    swing = float(np.ptp(v))
+    top = min(swing, widest)
+    gaps: Array = np.append(none * swing, np.geomspace(smallest * min(swing, top), top, 32))
+    # Of so many at once that memory holds them.
+    parts = np.array_split(gaps, 1 + len(gaps) * len(v) * (1 + family.count) // 500_000)
+    found = [h for part in parts for h in compared(part) if isfinite(h.evidence)]
+    e = [-inf, *(h.evidence for h in found), -inf]
+    peaks = sorted((h for k, h in enumerate(found) if e[k] < e[k + 1] > e[k + 2]), reverse=True)[:3]
+    return [*peaks, *sorted({*found} - {*peaks}, reverse=True)], float(value(y_rest @ y_rest))
 
 
 def _bins(v: Array) -> NDArray[np.intp]:
