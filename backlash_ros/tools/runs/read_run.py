@@ -19,7 +19,6 @@ from rosbags.typesys import Stores, get_typestore
 from backlash_ros import topics
 from backlash_ros.bags import REPAIR_COMMAND, BagError, BagReader, Topic, is_bag
 from backlash_ros.core.loop.learned_model import LearnedModel, from_fields
-from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.closed_loop import ClosedLoop
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 from backlash_ros.tools.cli import WHOLE_SPAN, BrokenOffError, InputError, Span
@@ -42,7 +41,13 @@ def read_run(
     """
     if not path.exists():
         raise InputError(f'{path}: does not exist')
-    parameters = _parameters(path, config, axis)
+    folder, parameters = path if path.is_dir() else path.parent, None
+    # A bag lies in the folder of the results to which the parameters belong.
+    beside = [folder / CONFIG_FILE, *[folder.parent / CONFIG_FILE] * is_bag(path)]
+    if config := config or next(filter(Path.is_file, beside), None):
+        configuration = read_configuration(config)
+        known = axis in (configuration.axes or configuration.joints)
+        parameters = configuration.parameters(axis if known else ''.join(configuration.joints[:1]))
     period = parameters.sample_period if parameters else None
     if bag := find_bag(path):
         return replace(read_bag(bag, period, span, axis), parameters=parameters)
@@ -71,20 +76,6 @@ def read_run(
 def find_bag(path: Path) -> Path | None:
     """The bag at a path or in a folder of results, None where there is none."""
     return next((place for place in (path, path / BAG) if is_bag(place)), None)
-
-
-def _parameters(path: Path, config: Path | None, axis: str) -> Parameters | None:
-    """Those of the file, or of the one beside the run, None without; of the first joint if any."""
-    folder = path if path.is_dir() else path.parent
-    # A bag lies in the folder of the results to which the parameters belong.
-    beside = [folder / CONFIG_FILE, *[folder.parent / CONFIG_FILE] * is_bag(path)]
-    file = config or next(filter(Path.is_file, beside), None)
-    if file is None:
-        return None
-    configuration = read_configuration(file)
-    if axis not in (configuration.axes or configuration.joints):
-        axis = configuration.joints[0] if configuration.joints else ''
-    return configuration.parameters(axis)
 
 
 def run_loop(
@@ -198,10 +189,16 @@ def read_bag(
                           and topic.message_type == 'std_msgs/msg/Float64MultiArray')
     try:
         found, prefix, notes = _of_axis(content, axis)
-        models = found.pop(topics.MODEL)
         begin_ns = found[topics.SIGNALS][0][0]
-        tables = [_tabulate(*each, prefix, begin_ns) for each in found.items()]
-        restarted = _choose_section(tables, span)
+        # In lockstep the stamp is that of the newest tick that the recorder had heard: what belongs
+        # to the first signals may be stamped before them.
+        begin = span.from_s * 1e9 if span.from_s > 0.0 else -np.inf
+        found = {topic: [(stamp - begin_ns, message) for stamp, message in messages
+                         if begin <= stamp - begin_ns < span.to_s * 1e9]
+                 for topic, messages in found.items()}
+        models = found.pop(topics.MODEL)
+        tables = [_tabulate(*each, prefix) for each in found.items()]
+        restarted = _choose_section(tables)
         signals, estimates, truth = tables
         if not signals['stamp'].size:
             raise InputError('holds no sample between --from and --to')
@@ -231,10 +228,8 @@ def read_bag(
     unknown = np.full(count.size, np.nan)
     record = RunRecord(
         np.column_stack([columns.get(name, unknown) for name in COLUMNS]), sample_period,
-        int(heard[-1] - heard[0]) + 1 - heard.size,
-        _newest_model([message for stamp, message in models
-                       if signals['stamp'][0] <= stamp - begin_ns < span.to_s * 1e9], prefix),
-    )
+        int(heard[-1] - heard[0]) + 1 - heard.size, _newest_model(
+            [message for stamp, message in models if stamp >= signals['stamp'][0]], prefix))
     notes = [content.damage, *notes, restarted]
     return Run(record, None, columns['latency_s'], tuple(filter(None, notes)))
 
@@ -273,9 +268,9 @@ def _labels(message: Any) -> list[str]:
     return [each.label for each in message.layout.dim]
 
 
-def _tabulate(topic: str, messages: Messages, prefix: str, begin_ns: int) -> Table:
+def _tabulate(topic: str, messages: Messages, prefix: str) -> Table:
     """The messages of a topic, of several joints what is about the one with this prefix."""
-    if not messages:  # a real plant does not know its truth
+    if not messages:  # as a real plant does not know its truth
         return {label: np.empty(0) for label in (*topics.LABELS_OF[topic], 'stamp')}
     given = _labels(messages[0][1]) or topics.LABELS_OF[topic]
     if any(len(message.data) != len(given) for _, message in messages):
@@ -287,7 +282,7 @@ def _tabulate(topic: str, messages: Messages, prefix: str, begin_ns: int) -> Tab
         raise InputError(f'{topic} lacks {", ".join(missing)}')
     # A joint that was not answered has a row of nan.
     answered = ~np.isnan(list(table.values())).all(axis=0)
-    table['stamp'] = np.array([stamp - begin_ns for stamp, _ in messages], dtype=np.float64)
+    table['stamp'] = np.array([stamp for stamp, _ in messages], dtype=np.float64)
     return _rows(table, answered if prefix else slice(None))
 
 
@@ -296,16 +291,8 @@ def _rows(table: Table, chosen: Any) -> Table:
     return {label: column[chosen] for label, column in table.items()}
 
 
-def _choose_section(tables: list[Table], span: Span) -> str:
-    """Leave in the tables the rows of the span, and of its last run if there are several.
-
-    Returns what was left out in one sentence, '' for nothing.
-    """
-    # In lockstep the stamp is that of the newest tick that the recorder had heard: what belongs to
-    # the first signals may be stamped before them.
-    begin = span.from_s * 1e9 if span.from_s > 0.0 else -np.inf
-    tables[:] = [_rows(table, (table['stamp'] >= begin) & (table['stamp'] < span.to_s * 1e9))
-                 for table in tables]
+def _choose_section(tables: list[Table]) -> str:
+    """Leave in the tables the rows of the last run; what was left out in a sentence, or ''."""
     signals, note = tables[0], ''
     restarts = np.flatnonzero(np.diff(signals['sample']) <= 0) + 1
     # Where the count falls back that often, two nodes are at work.
