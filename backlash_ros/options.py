@@ -42,10 +42,7 @@ def port(text: str) -> int:
 def add_motion_options(
     parser: argparse.ArgumentParser | argparse._ArgumentGroup, duration_s: float, what: str,
 ) -> None:
-    """Add what those who listen to a driver, or move it, have to know besides --drive.
-
-    what: --duration is, with its default duration_s.
-    """
+    """Add what --drive and its like take. what: --duration is, with its default duration_s."""
     for name, default, unit, text in (
         ('duration', duration_s, 'SECONDS', f'{what} (default: {duration_s:g})'),
         ('wait', 10.0, 'SECONDS', 'how long to wait for a driver (default: 10)'),
@@ -60,10 +57,7 @@ def add_motion_options(
 
 
 def find_config(config: Path | None) -> Path:
-    """Path of a configuration file: as given, or else among the shipped ones by name.
-
-    None is the shipped example of the paper.
-    """
+    """Path of a configuration file: as given, or among the shipped ones; None: the paper's."""
     if config is not None and (config.exists() or config.parent != Path()):
         return config
     package, given = 'backlash_ros', config or Path(DEFAULT_CONFIG)

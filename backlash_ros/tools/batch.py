@@ -55,10 +55,7 @@ class Job(NamedTuple):
 
 
 class ParameterStatistics(NamedTuple):
-    """Of one estimated parameter over runs.
-
-    settling times [s]: inf for never. within: share of runs within 1 % at the end.
-    """
+    """Of one estimate over runs: settling times [s], inf for never; share of runs within 1 %."""
 
     bias: float
     rmse: float
@@ -68,10 +65,7 @@ class ParameterStatistics(NamedTuple):
 
 
 def combinations(texts: Sequence[str]) -> list[dict[str, Value]]:
-    """Every combination of the values of sweeps `KEY=v1,v2,...`, the last one changing fastest.
-
-    The values are written as in a YAML list. Raises InputError and ParameterError.
-    """
+    """Every combination of sweeps `KEY=v1,v2,...`, as in YAML, the last one changing fastest."""
     sweeps: dict[str, list[Value]] = {}
     for text in texts:
         name, _, listed = map(str.strip, text.partition('='))
@@ -95,10 +89,7 @@ def make_jobs(
     parameters: Parameters, changes: Sequence[Mapping[str, Value]], seeds: Sequence[int],
     duration: float | None,
 ) -> list[Job]:
-    """One job for each change and, within it, each seed (its own if it changes the seed).
-
-    Every combination is built once, so that a bad one is refused before anything starts.
-    """
+    """One job for each change and each seed; every combination is built once, and so checked."""
     jobs = []
     for change in changes:
         changed = parameters.replaced(change)
@@ -129,8 +120,7 @@ def run_jobs(
     """Outcomes in the order of the jobs, the same wherever they were computed.
 
     workers: None takes one process per processor, 1 none besides this one. cluster: address of a
-    Dask scheduler, whose workers are used instead. Call it from the main thread, which alone
-    receives signals. Raises BrokenOffError if a worker was killed.
+    Dask scheduler, whose workers are used instead. Call it from the main thread.
     """
     workers = min(workers or len(os.sched_getaffinity(0)), len(jobs))
     finished = _on_cluster(jobs, cluster) if cluster is not None else \
@@ -172,7 +162,6 @@ def _in_processes(jobs: Sequence[Job], workers: int) -> Finished:
 
 
 def _end_with_parent() -> None:
-    """Let this worker end when its parent does, of whatever cause."""
     parent = multiprocessing.parent_process()
     assert parent is not None
 
@@ -184,11 +173,7 @@ def _end_with_parent() -> None:
 
 
 def _on_cluster(jobs: Sequence[Job], address: str) -> Finished:
-    """A run whose worker is lost is given to another one. address: as tcp://HOST:PORT.
-
-    Raises InputError where there is no such cluster, or one with other libraries; BrokenOffError
-    where it ends before the runs do, or a run has ended several workers.
-    """
+    """A run whose worker is lost is given to another one. address: as tcp://HOST:PORT."""
     try:
         from distributed import Client, KilledWorker
         from distributed import TimeoutError as NoAnswerError
@@ -231,10 +216,7 @@ def libraries() -> dict[str, str]:
 
 
 def statistics(outcomes: Sequence[Outcome]) -> dict[str, ParameterStatistics]:
-    """Statistics of each estimated parameter over the runs that did not break off.
-
-    Raises InputError where all of them did.
-    """
+    """Of each estimate over the runs that did not break off; raises InputError where all did."""
     whole = [outcome for outcome in outcomes if not outcome['problem']]
     if not whole:
         raise InputError(f'every run broke off, the first one with: {outcomes[0]["problem"]}')

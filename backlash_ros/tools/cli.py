@@ -74,10 +74,7 @@ def span_of(parser: argparse.ArgumentParser, options: argparse.Namespace) -> Spa
 
 
 def number_of_samples(parameters: Parameters, duration: float | None) -> int:
-    """Length of a run: duration [s] if given, else the parameter samples, else 10 s.
-
-    Raises InputError unless the duration is a whole number of sample periods, at least one.
-    """
+    """Length of a run: duration [s] if given, else the parameter samples, else 10 s."""
     if duration is None and parameters.samples > 0:
         return parameters.samples
     duration = 10.0 if duration is None else duration
@@ -146,8 +143,7 @@ def number(value: float | None, digits: int = 4, unit: str = '', scale: float = 
 class StopRequests:
     """Counts SIGINT, SIGTERM and SIGHUP as long as the context lasts, instead of dying of them.
 
-    One Ctrl-C may come twice, from the terminal and from whoever started the process: what follows
-    within 0.2 s does not count.
+    What follows within 0.2 s does not count: a Ctrl-C may come from two sides.
     """
 
     def __init__(self) -> None:

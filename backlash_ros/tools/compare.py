@@ -33,10 +33,7 @@ GAPLESS = {'backlash.c_r': 1e-9, 'backlash.c_l': -1e-9}
 
 
 class Result(NamedTuple):
-    """What became of a loop; note: why the run broke off.
-
-    merits: what stands in the table behind the name, None where it does not apply.
-    """
+    """What became of a loop, as the table has it. note: why the run broke off."""
 
     name: str
     merits: tuple[float | None, ...] = ()

@@ -32,10 +32,7 @@ ANY = '**'
 
 
 class Section(NamedTuple):
-    """Checked values under one name of a file.
-
-    axis: ANY for a wildcard, empty for the node without a namespace. node: ANY for all nodes.
-    """
+    """Checked values of a file; axis: a name, ANY, or '' for a node without a namespace."""
 
     name: str
     axis: str
@@ -57,10 +54,7 @@ class Setting(NamedTuple):
 
 @dataclass(frozen=True)
 class Configuration:
-    """A file with what the command line changes in it.
-
-    axes: empty for a run without. joints: of one controller, empty for a file without.
-    """
+    """A file with what the command line changes in it; axes of controllers, joints of one."""
 
     path: Path
     sections: Sequence[Section]
@@ -70,10 +64,7 @@ class Configuration:
     joints: tuple[str, ...]
 
     def parameters(self, axis: str = '') -> Parameters:
-        """Return the complete set of one loop: defaults, the file, then --set, then --seed.
-
-        axis: one of the axes, or of the joints, empty only if there are none; raises InputError.
-        """
+        """Of a loop, maybe that of a joint: defaults, the file, --set, --seed."""
         if self.joints and axis not in self.joints:
             raise InputError(
                 f'{self.path}: holds the joints {", ".join(self.joints)} of one controller: choose '
@@ -175,7 +166,7 @@ def _merged(path: Path, sections: Sequence[Section]) -> dict[str, Value]:
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """SafeLoader that refuses a key given twice, of which YAML would keep the last one."""
+    """Refuses a key given twice, of which YAML would keep the last one."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         keys = [self.construct_object(key, deep=True) for key, _ in node.value]
@@ -187,7 +178,6 @@ class _StrictLoader(yaml.SafeLoader):
 
 
 def _read_sections(path: Path) -> list[Section]:
-    """Read and check a file; raises InputError and ParameterError, which name the file."""
     try:
         document = yaml.load(path.read_text(encoding='utf-8'), Loader=_StrictLoader)
     except OSError as error:
@@ -228,7 +218,6 @@ def flattened(tree: Mapping[object, object], prefix: str = '') -> Iterator[tuple
 
 
 def _checked(name: str, values: Mapping[str, object], joints: Sequence[str]) -> Section:
-    """A section of a file; raises InputError for its name, ParameterError for what it holds."""
     axis, _, node = name.removeprefix('/').rpartition('/')
     if name == f'/{ANY}':
         axis = ANY
@@ -254,7 +243,7 @@ def _checked(name: str, values: Mapping[str, object], joints: Sequence[str]) -> 
 
 
 class _Dumper(yaml.SafeDumper):
-    """SafeDumper that writes each list on one line."""
+    """Writes each list on one line."""
 
 
 _Dumper.add_representer(list, lambda dumper, values: dumper.represent_sequence(
@@ -267,11 +256,7 @@ def write_config(parameters: Parameters, path: Path) -> None:
 
 
 def config_text(parameters: Parameters) -> str:
-    """Content of that file.
-
-    What is of bringup alone stands in a section of its own, and only if it is given. Empty lists,
-    which ROS 2 does not have, are left out.
-    """
+    """Content of that file, without empty lists, which ROS 2 does not have."""
     common = [p for p in BY_NAME.values() if p.used_by != (BRINGUP,) and parameters[p.name] != ()]
     own = [p.name for p in BY_NAME.values()
            if p not in common and parameters[p.name] != p.default]

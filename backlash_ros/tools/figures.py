@@ -13,8 +13,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Status
+from backlash_ros.core.plant.backlash import Backlash
 from backlash_ros.core.simulation.run_record import SETTLING_TOLERANCE, RunRecord
-from backlash_ros.tools.runs.summary import ErrorCurves, Part, estimated_loop
+from backlash_ros.tools.runs.summary import ErrorCurves, Part
 from backlash_ros.topics import BACKLASH
 
 Array = NDArray[np.float64]
@@ -111,8 +112,7 @@ def draw_panels(
 ) -> tuple[Figure, NDArray[Any]]:
     """A figure whose columns show parts of a run, and its axes, shape (rows, parts).
 
-    rows: lines by what stands at the vertical axis. frozen_in: the run whose times without learning
-    are shaded.
+    rows: lines by what stands at the vertical axis. frozen_in: shades its times without learning.
     """
     figure = new_figure(height)
     grid = np.asarray(figure.subplots(len(rows), len(parts), sharex='col', squeeze=False, **others))
@@ -200,12 +200,15 @@ def draw_hysteresis(run: RunRecord, end: Part) -> Figure:
     figure = new_figure(6.0)
     axes = figure.subplots()
     t, v, truth = run.column('t')[end.rows], run.column('v'), run.has_truth
-    u = run.column('u') if truth else estimated_loop(run)
+    m, c_r, c_l = (float(run.column(name)[-1]) for name in BACKLASH)
+    u = run.column('u') if truth else m * (v - c_r)
+    if not truth and c_l < c_r:
+        backlash = Backlash(m, c_r, c_l)
+        u = np.array([backlash.step(each) for each in v.tolist()])
     span = np.array(limits([v[end.rows]], margin=0.15))
-    for name, side in (('c_r', 'right'), ('c_l', 'left')):
-        m, c, true_m, true_c = (run.column(column)[-1]
-                                for column in ('m', name, 'true_m', f'true_{name}'))
+    for name, side, c in (('c_r', 'right', c_r), ('c_l', 'left', c_l)):
         if truth:
+            true_m, true_c = run.column('true_m')[-1], run.column(f'true_{name}')[-1]
             curve(axes, span, true_m * (span - true_c), HUES[name],
                   f'true {side} line\n$m(v - {name})$', width=6.0, alpha=0.35)
         curve(axes, span, m * (span - c), HUES[name],
@@ -251,10 +254,7 @@ def draw_input(run: RunRecord, parts: Sequence[Part]) -> Figure:
 
 
 def draw_error_curves(loops: Sequence[ErrorCurves], window_s: float) -> Figure:
-    """Size of the control error (Figure 5 of the paper), and of the tracking error if any is known.
-
-    window_s: over which the RMS was taken [s].
-    """
+    """RMS over window_s of the control errors (Figure 5 of the paper) and any tracking errors."""
     colours = [HUES[name] for name in ('m', 'c_r', 'c_l', 'v', 'u_d', 'y', 'y_m', 'u')]
     rows: dict[str, list[Line]] = {
         f'RMS of $u - u_d$ over {window_s:.3g} s\n[unit of u]': [],

@@ -21,10 +21,9 @@ def page(
     title: str, lead: str, warnings: Sequence[str], parts: Sequence[str],
     pictures: Sequence[Picture], folded: tuple[str, str] | None = None,
 ) -> str:
-    """A page as text.
+    """A page as text; lead and parts are HTML.
 
-    lead: the outcome in a sentence, HTML like the parts, which are sections between the warnings
-    and the pictures. folded: heading and text of a last section that opens on a click.
+    folded: heading and text of a last section that opens on a click.
     """
     sections = list(parts)
     for _, name, caption, data in pictures:

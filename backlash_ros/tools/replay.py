@@ -105,7 +105,6 @@ def _opened(path: Path, options: argparse.Namespace, span: cli.Span) -> Source:
 
 
 def _replayed(source: Source, title: str = '') -> RunRecord:
-    """Raises BrokenOffError."""
     with tqdm(total=source.recorded.samples, desc=f'{source.path.name} {title}', leave=False,
               disable=None) as bar:
         try:

@@ -29,10 +29,7 @@ HTML_SYMBOLS = {'m': 'm', 'c_r': 'c<sub>r</sub>', 'c_l': 'c<sub>l</sub>'}
 
 
 def write_report(run: files.Run, out: Path) -> dict[str, Any]:
-    """Write report, figures, samples.csv and summary.json of a run to out; return the summary.
-
-    Raises InputError for a run without samples.
-    """
+    """Write report, figures, samples.csv and summary.json of a run to out; return the summary."""
     summary = told.summarise(run.record, run.parameters, run.latency_s)
     notes, lost = list(run.notes), summary['lost_samples']
     if lost > 0.01 * (total := lost + summary['samples']) \
@@ -64,7 +61,6 @@ def write_report(run: files.Run, out: Path) -> dict[str, Any]:
 def _figures(
     run: RunRecord, parameters: Parameters | None, summary: Mapping[str, Any],
 ) -> Iterator[Picture]:
-    """The figures of all that this run allows, in their order."""
     if not np.isfinite(run.column('m')).any():
         yield Picture(
             'log.png', 'v and y', 'What the log holds, as it was read. With play, y over v is a '
@@ -135,7 +131,6 @@ def headline(summary: Mapping[str, Any]) -> str:
 
 
 def _tables(summary: Mapping[str, Any]) -> str:
-    """The backlash that was learned, and what else is known of the run."""
     rows = [
         (symbol, *told.estimate_cells(summary, name), 'of u/v' if name == 'm' else 'of v')
         for name, symbol in HTML_SYMBOLS.items()

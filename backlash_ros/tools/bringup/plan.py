@@ -22,10 +22,10 @@ ELSEWHERE = 'none'  # the parameter driver where somebody else starts it
 
 @dataclass(frozen=True)
 class AxisPlan:
-    """One controller of a run; its parameters are complete and checked, its folder exists.
+    """One controller of a run, its parameters complete and checked; name: also its namespace.
 
-    name: also its namespace, empty for a run without axes. Of the parameters, samples is the length
-    of the whole run, 0 without end, and driver a command, empty for the simulated plant.
+    Of the parameters, samples is the length of the whole run, 0 without end, and driver a command,
+    empty for the simulated plant.
     """
 
     name: str
@@ -57,10 +57,7 @@ class AxisPlan:
 
 @dataclass(frozen=True)
 class RunPlan:
-    """All that runs together: one controller without a name, or one for each axis.
-
-    live_port: of the page in the browser, 0 for a free one, None without a page.
-    """
+    """The controllers of a run. live_port: of the page in the browser, 0 for a free one."""
 
     axes: tuple[AxisPlan, ...]
     out: Path
@@ -68,10 +65,7 @@ class RunPlan:
 
 
 def prepare(options: argparse.Namespace) -> RunPlan:
-    """Check all input, then make the result folders; raises ParameterError or InputError.
-
-    Raises BrokenOffError where there is no ROS 2 to run the nodes with.
-    """
+    """Check all input, then make the result folders."""
     if ros_is_missing():
         raise BrokenOffError(ROS_MISSING)
     configuration = read_configuration(options.config, options.settings, options.seed)
@@ -154,8 +148,7 @@ def plan_processes(plan: RunPlan, domain: int | None) -> list[list[Child]]:
     """The processes of a run by stages, which are to be stopped one after the other.
 
     A simulated plant stops first, so that no output stays without its answer. With a driver the
-    controller goes first and the driver hears its last command. The recorder goes last and has
-    everything that the others have said. domain: ROS_DOMAIN_ID to set, None to leave it alone.
+    controller goes first and the driver hears its last command. The recorder goes last.
     """
     stages: list[list[Child]] = [[], [], [], []]
     served: dict[str, list[AxisPlan]] = {}

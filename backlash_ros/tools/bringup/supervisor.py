@@ -1,8 +1,7 @@
 """Child processes: started together, listened to, stopped in order, none of them left behind.
 
-Every child leads a process group of its own, so that a Ctrl-C of the terminal reaches the
-supervisor alone. A guardian, this module as a program, holds the other end of a pipe: when the
-supervisor dies of whatever cause, the pipe closes and the guardian stops what is left.
+Every child leads a process group of its own, which no Ctrl-C of the terminal reaches. When the
+supervisor dies, a pipe closes, and this module as a program, the guardian, stops what is left.
 """
 
 import json
@@ -30,10 +29,7 @@ Events = list[tuple[Any, dict[str, Any]]]  # of a child each
 
 
 def child_environment(log_folder: Path, domain: int | None) -> dict[str, str]:
-    """Environment of nodes that report events and are confined to this machine.
-
-    What the user has set stays. domain: ROS_DOMAIN_ID to set, None to leave it alone.
-    """
+    """Environment of nodes on this machine; what the user has set stays, the domain if None."""
     environment = {
         'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', 'ROS_LOG_DIR': str(log_folder / 'ros'),
         **ONE_THREAD, **with_source(os.environ), 'BACKLASH_ROS_EVENTS': '1',
@@ -52,10 +48,7 @@ def with_source(environment: Mapping[str, str]) -> dict[str, str]:
 
 
 def foreign_environment(environment: Mapping[str, str]) -> dict[str, str]:
-    """The same for a program that is no node of this package and may be of another Python.
-
-    ROS 2 wheels have set variables for this Python alone, with which those of another one fail.
-    """
+    """The same for another program: what ROS 2 wheels have set is for this Python alone."""
     foreign = dict(environment)
     foreign.pop('BACKLASH_ROS_EVENTS', None)
     if foreign.pop('_ROS_WHEELS_BOOTSTRAP_COMPLETE', None):
@@ -70,8 +63,7 @@ def free_domain() -> Iterator[int]:
     """A ROS_DOMAIN_ID that nobody on this machine uses, reserved as long as the context lasts.
 
     Domain d has the UDP ports from 7400 + 250 d on, of which participant n takes 10 + 2 n and
-    11 + 2 n (RTPS 2.5, 9.6.2); a port that no participant ever uses reserves it. Raises
-    BrokenOffError if all are in use.
+    11 + 2 n (RTPS 2.5, 9.6.2); a port that no participant ever uses reserves it.
     """
     domains = 101  # those that lie below the ports that Linux hands out to others
     # Starting at the process id spreads runs that start at the same moment.
@@ -164,9 +156,7 @@ class Child:
 class ProcessSupervisor:
     """Starts processes as a context manager and has stopped all of them when it is left.
 
-    stages: in the order in which they are to be stopped, those of one stage together; all are
-    started together. hurry: asked while stopping; once it says yes, nobody is given any more time.
-    children: those that were started.
+    stages: in the order in which they are to be stopped. hurry: whether nobody gets any more time.
     """
 
     def __init__(self, stages: Sequence[Sequence[Child]], hurry: Callable[[], bool]) -> None:
@@ -224,7 +214,7 @@ class ProcessSupervisor:
         return last_words
 
     def _to_stop(self) -> list[tuple[list[int], float, float]]:
-        """Of each stage its process groups, and the longest settle_s and grace_s of them."""
+        """Of each stage its process groups, and the longest settle_s and grace_s."""
         return [(
             [child.process.pid for child in stage if child in self.children],
             max((child.settle_s for child in stage), default=0.0),
@@ -238,8 +228,7 @@ def stop_groups(
 ) -> None:
     """Signal process groups, ever more firmly, until none is alive or all means are used up.
 
-    settle_s: before the first signal. grace_s: how much longer that may take than usual. wait:
-    passes a moment. hurry: yes skips to SIGKILL.
+    settle_s: before the first signal. grace_s: beyond the usual time. hurry: skips to SIGKILL.
     """
     (first, usual_s), *others = ESCALATION
     # The signal 0 is none.

@@ -37,12 +37,10 @@ def describe(progress: Mapping[str, Any]) -> str:
 
 @dataclass
 class AxisProgress:
-    """How far an axis has come, said now and then, and how long to wait for its next sample.
+    """How far an axis has come. first: number of the sample that counts as the first.
 
-    made: samples so far. first: number of the one that counts as the first. began, moved,
-    next_line: when the run began, when the newest sample was heard of, when the next line is due,
-    on the monotonic clock [s]. published: samples and messages by topic that can have been heard of
-    a simulated plant, once it is done; heard: those that were. silent: whether that was said.
+    began, moved, next_line: on the monotonic clock [s]. published: samples and messages by topic of
+    a simulated plant that is done; heard: those of them that were. silent: whether that was said.
     """
 
     plan: AxisPlan
@@ -119,10 +117,7 @@ class AxisProgress:
 
 
 class RunWatch:
-    """Watches the processes of a run from start to end.
-
-    axes: how far each has come, by name. failure: what went wrong, empty as long as nothing did.
-    """
+    """Watches the processes of a run. failure: what went wrong, empty as long as nothing did."""
 
     def __init__(
         self, plan: RunPlan, supervisor: ProcessSupervisor, requests: StopRequests,
@@ -224,7 +219,6 @@ class RunWatch:
             complain(axis.plan.titled(content['text']))
 
     def _judge_exits(self) -> None:
-        """Check the exit codes of the processes that were asked to end."""
         # A driver may end so of the signal that stops it; a shell adds 128 to its number.
         stopped = -signal.SIGINT, -signal.SIGTERM, 128 + signal.SIGINT, 128 + signal.SIGTERM
         for child in self._supervisor.children:

@@ -40,10 +40,7 @@ class Run:
 
 
 def result_directory(out: Path | None) -> Path:
-    """Create and return the folder of the results: out, or results/<UTC time>.
-
-    Only the latter is what results/latest then points at. Raises InputError.
-    """
+    """Create out, or results/<UTC time> where results/latest then points; raises InputError."""
     results = Path('results') if out is None else out
     try:
         results.mkdir(parents=True, exist_ok=True)
@@ -117,10 +114,7 @@ def read_record(path: Path) -> RunRecord:
 
 
 def read_samples(path: Path, sample_period: float | None = None) -> RunRecord:
-    """Read samples.csv, also one without the later columns; the true backlash is unknown.
-
-    sample_period: None takes the smallest distance of two rows. Raises InputError.
-    """
+    """Read samples.csv; sample_period: None takes the smallest distance. Raises InputError."""
     try:
         with path.open(encoding='utf-8') as file:
             names = tuple(file.readline().strip().split(','))

@@ -1,7 +1,4 @@
-"""Where runs come from: bags and folders of results, with what stands beside them; simulation.
-
-Of a bag: signals, estimates and truth, joined on the number of the sample.
-"""
+"""Runs from bags, joined on the number of the sample, from folders of results, from simulation."""
 
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -93,10 +90,7 @@ def run_loop(
 
 
 class Content(NamedTuple):
-    """Messages of the wanted topics by recorded name.
-
-    names: of all topics of the bag. damage: what is wrong with it and the cure, '' for nothing.
-    """
+    """Messages by recorded name, all topics, what is wrong with the bag, '' for nothing."""
 
     messages: dict[str, Messages]
     names: set[str]
@@ -136,10 +130,7 @@ def read_topics(path: Path, wanted: Callable[[Topic], bool]) -> Content:
 
 
 def choose_namespace(names: Sequence[str], axis: str) -> tuple[str, str]:
-    """One of the topics that end alike, '' for none, and a sentence about the others, or ''.
-
-    axis: the one that is wanted, '' for the first.
-    """
+    """That of an axis among topics that end alike, '' for none; a sentence about the others."""
     axes = [name.strip('/').split('/')[0] for name in names]
     if axis or not names:
         return names[axes.index(axis)] if axis in axes else '', ''
@@ -154,10 +145,9 @@ def topic_ends_like(name: str, topic: str) -> bool:
 
 
 def read_reports(path: Path, y: Array, axis: str = '') -> list[list[float]]:
-    """What applied_control reported between each output of a run and the one before it.
+    """What applied_control reported between each output y (N,) of a run and the one before it.
 
-    y (N,): outputs of the run, by whose values they are found among the messages. Empty where the
-    bag holds no applied_control, or the outputs are not all there. Raises InputError.
+    Empty where there is none, or the outputs are not all found by their values.
     """
     heard, _, _ = read_topics(path, lambda topic: topic.message_type == 'std_msgs/msg/Float64')
     outputs, reports = (heard.get(choose_namespace(
@@ -180,9 +170,8 @@ def read_bag(
 ) -> Run:
     """Read the run that a bag holds, of a damaged one what is left; its parameters are unknown.
 
-    t = (sample - first) * sample_period; None takes the median distance of the stamps. A gap in
-    the count is a lost sample. Where the controller was restarted, it is what the last one did
-    within the span. axis: of several, '' for the first. Raises InputError.
+    sample_period: None takes the median distance of the stamps. A gap in the count is a lost
+    sample. It is what the last controller did within the span. Raises InputError.
     """
     last_parts = {topic.rpartition('/')[2] for topic in topics.LABELS_OF}
     content = read_topics(path, lambda topic: topic.name.rpartition('/')[2] in last_parts
@@ -287,7 +276,6 @@ def _tabulate(topic: str, messages: Messages, prefix: str) -> Table:
 
 
 def _rows(table: Table, chosen: Any) -> Table:
-    """The rows that an index or a mask chooses."""
     return {label: column[chosen] for label, column in table.items()}
 
 
@@ -313,10 +301,7 @@ def _choose_section(tables: list[Table]) -> str:
 
 
 def _true_columns(v: Array, count: Array, truth: Table) -> Table:
-    """u where it was recorded, and the true backlash, of which the newest holds on.
-
-    The last v of a run is computed but never applied: its sample has no u.
-    """
+    """u where it was recorded (the last v never acts), and the newest true backlash."""
     sample = truth['sample']
     if sample.size == 0:
         return {}

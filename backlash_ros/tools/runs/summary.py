@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from backlash_ros.core.assembly import LAWS, build_structure, first_guess, law_fits
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.parameters import ParameterError, Parameters
-from backlash_ros.core.plant.backlash import Backlash
 from backlash_ros.core.reference.signal import PERIODIC
 from backlash_ros.core.simulation import run_record
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
@@ -32,10 +31,7 @@ class Part(NamedTuple):
 
 
 class ErrorCurves(NamedTuple):
-    """Moving RMS of the errors of a loop, shape (N,) each.
-
-    tracking: None where y is not meant to follow y_m.
-    """
+    """Moving RMS of the errors of a loop, shape (N,); tracking: only where y is to follow."""
 
     name: str
     t: Array
@@ -46,16 +42,20 @@ class ErrorCurves(NamedTuple):
 def summarise(
     run: RunRecord, parameters: Parameters | None, latency_s: Array | None = None,
 ) -> dict[str, Any]:
-    """Figures of merit of a run, the content of summary.json.
-
-    latency_s: of each sample, None for a simulation. Raises InputError for a run without samples.
-    """
+    """Figures of merit of a run, the content of summary.json; raises InputError without samples."""
     if run.samples == 0:
         raise InputError('the run holds no sample that reached the controller')
     t, status = run.column('t'), run.column('status')
     status = status[np.isfinite(status)]
     words = {float(state): state.word for state in Status}
     latency = np.empty(0) if latency_s is None else latency_s[np.isfinite(latency_s)]
+    # The estimates of the first command, and where they are from.
+    began: dict[str, Any] = {name: float(run.column(name)[0]) for name in (*BACKLASH, 'f')}
+    began['from'] = None
+    if parameters is not None:
+        guess, estimates = first_guess(parameters), parameters.estimates
+        loaded = estimates.load and any(began[name] != getattr(guess, name) for name in BACKLASH)
+        began['from'] = estimates.file if loaded else 'estimator.initial'
     newest, learned = dict(zip(COLUMNS, run.rows[-1].tolist(), strict=True)), run.learned
     return {
         'estimator': parameters.estimator.law if parameters else None,
@@ -63,7 +63,7 @@ def summarise(
         'samples': run.samples,
         'sample_period': run.sample_period,
         'lost_samples': run.lost_samples,
-        'began_with': _beginning(run, parameters),
+        'began_with': began,
         'final': {name: newest[name] for name in (*BACKLASH, 'f')},
         'final_std': {name: newest[f'std_{name}'] for name in BACKLASH},
         'truth': {name: newest[f'true_{name}'] if run.has_truth else None for name in BACKLASH},
@@ -72,7 +72,7 @@ def summarise(
             if run.has_truth else None for name in BACKLASH
         },
         'control_error_rms': run_record.control_error_rms(run),
-        'tracking_error_rms': _tracking_error_rms(run, _reference_delay(parameters)),
+        'tracking_error_rms': _following(run, parameters)[1],
         'loop_latency_ms': {
             f'p{q}': 1e3 * float(np.percentile(latency, q)) for q in (50, 99)
         } if latency.size else None,
@@ -88,26 +88,11 @@ def summarise(
     }
 
 
-def _beginning(run: RunRecord, parameters: Parameters | None) -> dict[str, Any]:
-    """The estimates of the first command, and where they are from; None where that is unknown."""
-    first = {name: float(run.column(name)[0]) for name in (*BACKLASH, 'f')}
-    if parameters is None:
-        return {**first, 'from': None}
-    guess = first_guess(parameters)
-    guessed = all(first[name] == getattr(guess, name) for name in BACKLASH)
-    loaded = parameters.estimates.load and not guessed
-    return {**first, 'from': parameters.estimates.file if loaded else 'estimator.initial'}
-
-
-def _reference_delay(parameters: Parameters | None) -> int:
-    """Samples by which y is to follow y_m late, which the structure decides; 0 if unknown."""
-    return build_structure(parameters).delay if parameters else 0
-
-
-def _tracking_error_rms(run: RunRecord, delay: int) -> float | None:
-    """Relative, over the last half."""
+def _following(run: RunRecord, parameters: Parameters | None) -> tuple[int, float | None]:
+    """Samples by which y is to follow y_m late, 0 if unknown; relative error of the last half."""
+    delay = build_structure(parameters).delay if parameters else 0
     half = float(run.column('t')[run.samples // 2])
-    return run_record.delayed_tracking_error_rms(run, delay, half)
+    return delay, run_record.delayed_tracking_error_rms(run, delay, half)
 
 
 def estimate_cells(summary: Mapping[str, Any], name: str) -> tuple[str, ...]:
@@ -133,7 +118,6 @@ def control_error(run: RunRecord) -> Array:
 
 
 def _reference_period(parameters: Parameters | None) -> float | None:
-    """Period of y_m [s]; None where it has none or is not known."""
     periodic = parameters is not None and parameters.waveform in PERIODIC
     return 2.0 * pi / parameters.frequency if parameters and periodic else None
 
@@ -162,8 +146,7 @@ def compare_laws(
 ) -> tuple[list[ErrorCurves], float, list[str]]:
     """The run's law beside every other one, simulated with the same parameters (Figure 5).
 
-    Over the run with its lost samples, 10,000 samples at most. Also over how long the RMS is taken
-    [s], a period of y_m, and what kept a law from its curve.
+    Also over how long the RMS is taken [s], and what kept a law from its curve.
     """
     t, own, notes = run.column('t'), parameters.estimator.law, []
     samples = min(round(float(t[-1]) / run.sample_period) + 1, 10_000)
@@ -188,20 +171,7 @@ def compare_laws(
 
 
 def followed_reference(run: RunRecord, parameters: Parameters | None) -> tuple[Array, float, bool]:
-    """What y is to follow, shape (N,), how late [s], and whether y comes close enough to it.
-
-    Then both are drawn on one scale.
-    """
-    delay = _reference_delay(parameters)
-    error = _tracking_error_rms(run, delay)
+    """What y is to follow, shape (N,), how late [s], and whether one scale suits both."""
+    delay, error = _following(run, parameters)
     close = error is not None and error < 0.5  # of the RMS of the reference
     return run_record.delayed_reference(run, delay), delay * run.sample_period, close
-
-
-def estimated_loop(run: RunRecord) -> Array:
-    """u = B[v] as the last estimates see it, for the v of the run, shape (N,)."""
-    m, c_r, c_l = (float(run.column(name)[-1]) for name in BACKLASH)
-    if c_l >= c_r:
-        return m * (run.column('v') - c_r)  # no gap left, and then no backlash to simulate
-    backlash = Backlash(m, c_r, c_l)
-    return np.array([backlash.step(v) for v in run.column('v').tolist()])
