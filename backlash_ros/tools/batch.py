@@ -21,13 +21,8 @@ from tqdm import tqdm
 from backlash_ros.core.parameters import BY_NAME, Parameters, Value, check_names, check_value
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.run_record import SETTLING_TOLERANCE
-from backlash_ros.tools.cli import (
-    ONE_THREAD,
-    BrokenOffError,
-    InputError,
-    StopRequests,
-    number_of_samples,
-)
+from backlash_ros.tools import cli
+from backlash_ros.tools.cli import BrokenOffError, InputError
 from backlash_ros.tools.runs.read_run import run_loop
 from backlash_ros.tools.runs.summary import summarise
 from backlash_ros.topics import BACKLASH
@@ -93,7 +88,7 @@ def make_jobs(
     jobs = []
     for change in changes:
         changed = parameters.replaced(change)
-        samples = number_of_samples(changed, duration)
+        samples = cli.number_of_samples(changed, duration)
         build_closed_loop(changed)
         own = [changed.seed] if 'seed' in change else seeds
         jobs += [Job(dict(changed.replaced({'seed': seed})), samples) for seed in own]
@@ -107,11 +102,9 @@ def run_job(job: Job) -> Outcome:
         summary = summarise(run_loop(build_closed_loop(parameters), job.samples), parameters)
     except BrokenOffError as error:
         return {**dict.fromkeys(OUTCOME_COLUMNS), 'problem': str(error)}
-    known = {**summary, 'problem': '', **{
-        f'{prefix}{name}': summary[group][name]
-        for prefix, group in OUTCOME_GROUPS.items() for name in BACKLASH
-    }}
-    return {name: known[name] for name in OUTCOME_COLUMNS}
+    known = {f'{prefix}{name}': summary[group][name]
+             for prefix, group in OUTCOME_GROUPS.items() for name in BACKLASH}
+    return {name: {**summary, **known, 'problem': ''}[name] for name in OUTCOME_COLUMNS}
 
 
 def run_jobs(
@@ -134,13 +127,13 @@ def run_jobs(
 
 
 def _in_processes(jobs: Sequence[Job], workers: int) -> Finished:
-    os.environ.update(ONE_THREAD)  # read when a worker imports numpy
+    os.environ.update(cli.ONE_THREAD)  # read when a worker imports numpy
     executor = ProcessPoolExecutor(
         workers, multiprocessing.get_context('spawn'), initializer=_end_with_parent)
     try:
         # A signal that would cut short the start of a worker takes effect afterwards, whichever
         # thread gets it.
-        with StopRequests() as held:
+        with cli.StopRequests() as held:
             # Workers inherit for good what is blocked: a Ctrl-C is for their parent alone.
             signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
             numbers = {executor.submit(run_job, job): i for i, job in enumerate(jobs)}

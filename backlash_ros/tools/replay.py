@@ -30,7 +30,7 @@ from backlash_ros.topics import BACKLASH
 
 
 class Source(NamedTuple):
-    """A recorded run and what it is replayed with; reports: as for core's `replay`."""
+    """A recorded run, and what it is replayed with."""
 
     path: Path
     recorded: RunRecord

@@ -1,34 +1,25 @@
 """One command for a whole run: start the nodes, watch them, stop them, report.
 
-driver: with --driver COMMAND that command runs in the place of the simulated plant, until the
-controller has seen as many samples as the duration holds. {axis} in it is the name of the axis;
-axes whose commands are the same share one driver. --driver none waits for a driver that you start
-yourself. The controller is stopped before the driver, which so hears its last command. As a driver
-moves something real, control.min, control.max and control.rate_max have to be set, or --unlimited
-given.
+driver: with --driver COMMAND that command runs in the place of the simulated plant, {axis} in it
+being the name of the axis; axes whose commands are the same share one driver. --driver none waits
+for a driver that you start yourself. As a driver moves something real, control.min, control.max and
+control.rate_max have to be set, or --unlimited given.
 
 axes: the parameter axes, in the section /bringup of the file, lists names; each gets nodes of its
-own in the namespace of that name and a folder DIR/NAME. Values stand under /**, /**/NODE,
-/NAME/** or /NAME/NODE; a named node goes before a named axis. If one axis fails, all are stopped.
+own in the namespace of that name and a folder DIR/NAME. If one axis fails, all are stopped.
 
 joints: a file with the parameter joints is one controller for all of them, with its recorder. It
 needs --driver; y_m comes from whoever plans the motion. Each joint gets a report in DIR/JOINT.
 
---duration inf runs until Ctrl-C.
-
 exit codes: 0 done, 2 bad input, 1 anything else (a process died, nothing moves, interrupted).
-
 A first Ctrl-C (SIGTERM, SIGHUP) stops all processes in order and reports what was recorded, a
-second one kills them at once. It is the regular end of a run without end (--duration inf), which
-then returns 0. If bringup itself is killed, a guardian process stops the others.
+second one kills them at once. It is the regular end of a run with --duration inf.
 
-environment: the processes inherit it. Unless you set them yourself,
+environment: unless you set them yourself,
   ROS_AUTOMATIC_DISCOVERY_RANGE  is LOCALHOST: nothing leaves this machine
-  ROS_DOMAIN_ID                  is one that nobody uses on this machine, so that two runs never
-                                 hear each other, or 0 with --driver none; it is printed, so that
-                                 you can listen in
+  ROS_DOMAIN_ID                  is one that nobody uses on this machine, or 0 with --driver none;
+                                 it is printed, so that you can listen in
   ROS_LOG_DIR                    is DIR/logs/ros
-  OMP_NUM_THREADS and its like   are 1
 """
 
 import argparse

@@ -5,6 +5,7 @@ import io
 import json
 import zipfile
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from itertools import count
@@ -41,7 +42,7 @@ class Run:
 
 def result_directory(out: Path | None) -> Path:
     """Create out, or results/<UTC time> where results/latest then points; raises InputError."""
-    results = Path('results') if out is None else out
+    results = out or Path('results')
     try:
         results.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -49,13 +50,11 @@ def result_directory(out: Path | None) -> Path:
     if out is not None:
         return out
     name = datetime.now(timezone.utc).strftime('%Y-%m-%dT%H-%M-%SZ')
-    # Two runs within one second need two names.
-    for directory in (results / (f'{name}-{n}' if n else name) for n in count()):
-        try:
+    for n in count():  # two runs within one second need two names
+        directory = results / (f'{name}-{n}' if n else name)
+        with suppress(FileExistsError):
             directory.mkdir()
-        except FileExistsError:
-            continue
-        break
+            break
     point_link(results / 'latest', directory.name)
     return directory
 
