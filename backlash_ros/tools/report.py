@@ -68,50 +68,43 @@ def _figures(
             png(figures.draw_log(run)))
         return
     start, end = parts = told.interesting_parts(run, parameters)
-    if run.has_truth:
-        yield Picture(
-            'parameter_errors.png', 'Parameter errors over time (Figure 4 of the paper)',
-            'How far the estimates are from the hidden backlash, and in percent of it. A dot marks '
-            'the time from which the error stays within 1 %.',
-            png(figures.draw_parameter_errors(run, start, summary['settling_time_s'])))
-    yield Picture(
-        'estimates.png', 'Estimates over time', 'What the controller has learned from v and y '
-        'alone; a band shows how sure it is where the law knows.',
-        png(figures.draw_estimates(run)))
-    error, innovation = told.control_error(run), run.column('innovation')
-    if np.isfinite(error).any():
-        yield Picture(
-            'control_error.png', 'Control error of this run',
-            'e = u − u<sub>d</sub> (3.4): what the inverse leaves of the backlash.',
-            png(figures.draw_closer(run, error, '$u - u_d$ [unit of u]', parts)))
-    elif np.isfinite(innovation).any():
-        yield Picture(
-            'innovation.png', 'Innovation',
-            'y minus its prediction. White and small: the model explains the plant.',
-            png(figures.draw_closer(run, innovation, r'$y - \hat{y}$ [unit of y]', parts)))
-    if run.has_truth and parameters is not None:
-        curves, window_s, notes = told.compare_laws(run, parameters)
-        duration = min(float(run.column('t')[-1]) + run.sample_period, 1e4 * run.sample_period)
-        yield Picture(
-            'laws.png', 'Control error of the laws (Figure 5 of the paper)',
-            'This run beside the other laws, simulated with the same parameters, over the first '
-            f'{duration:.6g} s.' + ''.join(f' Without a curve: {escape(note)}.' for note in notes),
-            png(figures.draw_error_curves(curves, window_s)))
-    yield Picture(
-        'hysteresis.png', 'Backlash: the v–u loop',
-        'u follows the right line going up, the left line going down, and is held between them. '
-        'Where a dashed line lies on the wide one, the estimate is right.' if run.has_truth else
-        'The loop as the last estimates see it: u itself was not measured.',
-        png(figures.draw_hysteresis(run, end)))
+    truth, error, innovation = run.has_truth, told.control_error(run), run.column('innovation')
+    curves, window_s, notes = told.compare_laws(run, parameters) if truth and parameters else \
+        ([], 0.0, [])
+    known = np.isfinite(error).any()
+    duration = min(float(run.column('t')[-1]) + run.sample_period, 1e4 * run.sample_period)
     y_m, delay, followed = told.followed_reference(run, parameters)
-    yield Picture(
-        'output.png', 'Reference and output', 'y follows y<sub>m</sub>.' if followed else
-        'Each on its own scale: y does not follow y<sub>m</sub>, nor does the structure '
-        'u<sub>d</sub> = y<sub>m</sub> + f v aim at that.',
-        png(figures.draw_output(run, end, y_m, delay, followed)))
-    yield Picture(
-        'input.png', 'Desired input and control', 'v jumps by the width of the gap whenever '
-        'u<sub>d</sub> turns.', png(figures.draw_input(run, parts)))
+    for wanted, name, heading, caption, draw, *arguments in (
+        (truth, 'parameter_errors', 'Parameter errors over time (Figure 4 of the paper)',
+         'How far the estimates are from the hidden backlash, and in percent of it. A dot marks '
+         'the time from which the error stays within 1 %.',
+         figures.draw_parameter_errors, start, summary['settling_time_s']),
+        (True, 'estimates', 'Estimates over time', 'What the controller has learned from v and y '
+         'alone; a band shows how sure it is where the law knows.', figures.draw_estimates),
+        (known, 'control_error', 'Control error of this run',
+         'e = u − u<sub>d</sub> (3.4): what the inverse leaves of the backlash.',
+         figures.draw_closer, error, '$u - u_d$ [unit of u]', parts),
+        (not known and np.isfinite(innovation).any(), 'innovation', 'Innovation',
+         'y minus its prediction. White and small: the model explains the plant.',
+         figures.draw_closer, innovation, r'$y - \hat{y}$ [unit of y]', parts),
+        (curves, 'laws', 'Control error of the laws (Figure 5 of the paper)',
+         'This run beside the other laws, simulated with the same parameters, over the first '
+         f'{duration:.6g} s.' + ''.join(f' Without a curve: {escape(note)}.' for note in notes),
+         lambda _: figures.draw_error_curves(curves, window_s)),
+        (True, 'hysteresis', 'Backlash: the v–u loop',
+         'u follows the right line going up, the left line going down, and is held between them. '
+         'Where a dashed line lies on the wide one, the estimate is right.' if truth else
+         'The loop as the last estimates see it: u itself was not measured.',
+         figures.draw_hysteresis, end),
+        (True, 'output', 'Reference and output', 'y follows y<sub>m</sub>.' if followed else
+         'Each on its own scale: y does not follow y<sub>m</sub>, nor does the structure '
+         'u<sub>d</sub> = y<sub>m</sub> + f v aim at that.',
+         figures.draw_output, end, y_m, delay, followed),
+        (True, 'input', 'Desired input and control', 'v jumps by the width of the gap whenever '
+         'u<sub>d</sub> turns.', figures.draw_input, parts),
+    ):
+        if wanted:
+            yield Picture(f'{name}.png', heading, caption, png(draw(run, *arguments)))
 
 
 def headline(summary: Mapping[str, Any]) -> str:
