@@ -150,13 +150,13 @@ def _signals(path: Path) -> tuple[dict[str, Signal], str]:
         words = ('command', 'cmd', 'goal', 'target', 'setpoint')
         return any(word in topic.lower() for word in words)
 
-    content = read_topics(path, lambda topic: topic.message_type in NUMBERS_OF and (
+    recorded, _, damage = read_topics(path, lambda topic: topic.message_type in NUMBERS_OF and (
         topic.message_type != ARRAY or is_command(topic.name)))
     series: dict[tuple[str, bool, str], list[tuple[int, float]]] = {}
-    for topic, messages in sorted(content.messages.items()):
+    for topic, messages in sorted(recorded.items()):
         for stamp, message in messages:
             for part, joint, value in NUMBERS_OF[message.__msgtype__](message):
                 signal = topic.removeprefix('/') + part, is_command(topic), joint
                 series.setdefault(signal, []).append((stamp, float(value)))
     return {name: Signal(as_messages(pairs), commanded, joint)
-            for (name, commanded, joint), pairs in series.items()}, content.damage
+            for (name, commanded, joint), pairs in series.items()}, damage

@@ -7,7 +7,7 @@ from dataclasses import replace
 from itertools import chain, pairwise
 from math import isnan
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,19 +89,11 @@ def run_loop(
         raise BrokenOffError(f'the run broke off: {reason}') from error
 
 
-class Content(NamedTuple):
-    """Messages by recorded name, all topics, what is wrong with the bag, '' for nothing."""
-
-    messages: dict[str, Messages]
-    names: set[str]
-    damage: str
-
-
-def read_topics(path: Path, wanted: Callable[[Topic], bool]) -> Content:
-    """Decode the wanted topics of a bag, or what is left of them; raises InputError."""
-    types = get_typestore(Stores.ROS2_JAZZY)
-    found: dict[str, Messages] = {}
-    garbled, damage = 0, ''
+def read_topics(
+    path: Path, wanted: Callable[[Topic], bool],
+) -> tuple[dict[str, Messages], list[str], str]:
+    """Messages of the wanted topics of a bag by name, all topics, what is wrong with the bag."""
+    types, found, damage = get_typestore(Stores.ROS2_JAZZY), dict[str, Messages](), ''
     try:
         reader = BagReader(path)
     except BagError as error:
@@ -112,21 +104,20 @@ def read_topics(path: Path, wanted: Callable[[Topic], bool]) -> Content:
             message = types.deserialize_cdr(raw, topic.message_type)
             found.setdefault(topic.name, []).append((stamp_ns, message))
         except Exception:
-            garbled += 1
+            damage = 'is damaged'
     for messages in found.values():
         messages.sort(key=lambda each: each[0])
-    if reader.damage and not reader.topics:
-        raise InputError(f'{path}: {reader.damage}, and nothing of it can be read')
-    if reader.damage or garbled:
+    damage = reader.damage or damage
+    if damage and not reader.topics:
+        raise InputError(f'{path}: {damage}, and nothing of it can be read')
+    if damage:
         stamps = [stamp for messages in found.values() for stamp, _ in messages] or [0]
-        unread = f', {garbled} more cannot be decoded' if garbled else ''
         damage = (
-            f'{path} {reader.damage or "is damaged"}: this is what is left, '
-            f'{sum(map(len, found.values()))} messages of '
-            f'{1e-9 * (max(stamps) - min(stamps)):.1f} s{unread}; once it is not being recorded '
-            f'any more, `{REPAIR_COMMAND} {path}` completes it'
+            f'{path} {damage}: this is what is left, {sum(map(len, found.values()))} messages of '
+            f'{1e-9 * (max(stamps) - min(stamps)):.1f} s; once it is not being recorded any more, '
+            f'`{REPAIR_COMMAND} {path}` completes it'
         )
-    return Content(found, {topic.name for topic in reader.topics}, damage)
+    return found, sorted(topic.name for topic in reader.topics), damage
 
 
 def choose_namespace(names: Sequence[str], axis: str) -> tuple[str, str]:
@@ -174,10 +165,11 @@ def read_bag(
     sample. It is what the last controller did within the span. Raises InputError.
     """
     last_parts = {topic.rpartition('/')[2] for topic in topics.LABELS_OF}
-    content = read_topics(path, lambda topic: topic.name.rpartition('/')[2] in last_parts
-                          and topic.message_type == 'std_msgs/msg/Float64MultiArray')
+    recorded, names, damage = read_topics(
+        path, lambda topic: topic.name.rpartition('/')[2] in last_parts
+        and topic.message_type == 'std_msgs/msg/Float64MultiArray')
     try:
-        found, prefix, notes = _of_axis(content, axis)
+        found, prefix, notes = _of_axis(recorded, names, axis)
         begin_ns = found[topics.SIGNALS][0][0]
         # In lockstep the stamp is that of the newest tick that the recorder had heard: what belongs
         # to the first signals may be stamped before them.
@@ -204,7 +196,7 @@ def read_bag(
             notes.append(f'the sample period of {sample_period:.6g} s was taken from the stamps of '
                          'the bag, as no parameters were given')
     except InputError as error:
-        raise InputError('; '.join(filter(None, (f'{path}: {error}', content.damage)))) from None
+        raise InputError('; '.join(filter(None, (f'{path}: {error}', damage)))) from None
     columns = {
         **_rows(signals, of_signals), **_rows(estimates, of_estimates),
         't': (count - count[0]) * sample_period,
@@ -219,15 +211,17 @@ def read_bag(
         np.column_stack([columns.get(name, unknown) for name in COLUMNS]), sample_period,
         int(heard[-1] - heard[0]) + 1 - heard.size, _newest_model(
             [message for stamp, message in models if stamp >= signals['stamp'][0]], prefix))
-    notes = [content.damage, *notes, restarted]
+    notes = [damage, *notes, restarted]
     return Run(record, None, columns['latency_s'], tuple(filter(None, notes)))
 
 
-def _of_axis(content: Content, axis: str) -> tuple[dict[str, Messages], str, list[str]]:
+def _of_axis(
+    recorded: dict[str, Messages], all_names: Sequence[str], axis: str,
+) -> tuple[dict[str, Messages], str, list[str]]:
     """The messages of one axis by topic; the prefix of its labels if it is a joint; notes."""
     found: dict[str, Messages] = {}
     prefix, notes = '', list[str]()
-    labels_of = {name: _labels(messages[0][1]) for name, messages in content.messages.items()}
+    labels_of = {name: _labels(messages[0][1]) for name, messages in recorded.items()}
     for topic, labels in topics.LABELS_OF.items():  # signals first
         # Nodes that were renamed are known by their labels.
         names = sorted(
@@ -246,10 +240,10 @@ def _of_axis(content: Content, axis: str) -> tuple[dict[str, Messages], str, lis
         if not name and topic in (topics.SIGNALS, topics.ESTIMATES):
             of_axis = f' of axis {axis}' if axis else ''
             raise InputError(f'holds no message of {topic}{of_axis}; its topics are '
-                             f'{", ".join(sorted(content.names)) or "none"}')
+                             f'{", ".join(all_names) or "none"}')
         if note:
             axis, notes = name.strip('/').split('/')[0], [*notes, note]
-        found[topic] = content.messages.get(name, [])
+        found[topic] = recorded.get(name, [])
     return found, prefix, notes
 
 
