@@ -134,7 +134,7 @@ def _compare(args: Sequence[str] | None) -> None:
     write_atomically(out / figure, png(draw_error_curves(curves, COMPARISON_WINDOW_S)))
     template = Template(Path(__file__).with_name('comparison.md').read_text(encoding='utf-8'))
     numbers = {'frequency': scenario.frequency, 'noise': scenario.output_noise_std,
-               **vars(scenario.backlash)}
+               **scenario.backlash._asdict()}
     write_atomically(document, template.substitute(
         {name: f'{value:g}' for name, value in numbers.items() if isinstance(value, float)},
         figure=figure, waveform=scenario.waveform, header=' | '.join(COMPARISON_HEADER),

@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
-from tqdm import tqdm
 
 from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core.estimate import Status
@@ -60,7 +59,7 @@ def _replay(args: Sequence[str] | None) -> None:
     for source in sources:
         for change in changes:
             words = ' '.join(f'{name}={as_yaml(value)}' for name, value in change.items())
-            run = _replayed(source._replace(parameters=source.parameters.replaced(change)), words)
+            run = _replayed(source._replace(parameters=source.parameters.replaced(change)))
             tracking = run.column('t')[run.column('status') == Status.TRACKING]
             innovation = run.column('innovation')[run.samples // 2:]
             known = innovation[np.isfinite(innovation)]
@@ -104,16 +103,13 @@ def _opened(path: Path, options: argparse.Namespace, span: cli.Span) -> Source:
     return Source(path, run.record, parameters, reports)
 
 
-def _replayed(source: Source, title: str = '') -> RunRecord:
-    with tqdm(total=source.recorded.samples, desc=f'{source.path.name} {title}', leave=False,
-              disable=None) as bar:
-        try:
-            return replay(source.recorded, source.parameters, lambda _: bar.update(),
-                          source.reports)
-        except ParameterError:
-            raise
-        except ValueError as error:
-            raise cli.BrokenOffError(f'the replay broke off: {error}') from error
+def _replayed(source: Source) -> RunRecord:
+    try:
+        return replay(source.recorded, source.parameters, source.reports)
+    except ParameterError:
+        raise
+    except ValueError as error:
+        raise cli.BrokenOffError(f'the replay broke off: {error}') from error
 
 
 def _one(source: Source, out: Path | None) -> None:

@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from functools import partial
 from math import inf
 
-from tqdm import tqdm
-
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.loop.diagnosis import Learning, LoopFigures, Neighbours, state_beside
 from backlash_ros.core.loop.sample_counter import Timing
@@ -54,9 +52,7 @@ def _once(parameters: Parameters, options: argparse.Namespace) -> None:
     cli.print_warnings('simulate', parameters)
     if options.out is not None:
         result_directory(options.out)  # fails before a long run, not after it
-    # disable=None: no bar where stderr is not a terminal.
-    with tqdm(total=samples, desc='simulate', unit='sample', disable=None) as bar:
-        run = run_loop(loop, samples, lambda _: bar.update())
+    run = run_loop(loop, samples)
     directory = result_directory(options.out)
     print(estimate_table(write_report(Run(run, parameters), directory)))
     law = loop.controller.estimator

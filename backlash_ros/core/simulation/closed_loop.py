@@ -32,8 +32,8 @@ class ClosedLoop:
     p: Parameters
     lose: Callable[[], bool] = lambda: False
 
-    def run(self, samples: int, on_sample: Callable[[int], None] | None = None) -> RunRecord:
-        """Simulate and return every signal; on_sample(k) is called after each sample."""
+    def run(self, samples: int) -> RunRecord:
+        """Simulate and return every signal."""
         values = array('d')  # row by row: NumPy takes longer to take in a row
         lost, v = 0, 0.0
         for k in range(samples):
@@ -49,8 +49,6 @@ class ClosedLoop:
                 u, truth = self.plant.step(v), self.plant.backlash
                 values.extend(row_of(
                     t, y, v, u, step, self.controller.estimator, (truth.m, truth.c_r, truth.c_l)))
-            if on_sample is not None:
-                on_sample(k)
         rows, learned = np.array(values), learned_model_of(self.controller.estimator, self.p)
         return RunRecord(rows.reshape(-1, len(COLUMNS)), self.sample_period,
                          self.controller.lost_samples + lost, learned)
@@ -66,8 +64,7 @@ def build_closed_loop(p: Parameters) -> ClosedLoop:
 
 
 def replay(
-    recorded: RunRecord, p: Parameters, on_sample: Callable[[int], None] | None = None,
-    reports: Sequence[Sequence[float]] = (),
+    recorded: RunRecord, p: Parameters, reports: Sequence[Sequence[float]] = (),
 ) -> RunRecord:
     """Feed y, y_m, v and losses of a record to a controller with these parameters.
 
@@ -109,8 +106,6 @@ def replay(
         controller.refine()
         rows[k] = row_of(t[k], y, v, np.nan, step, controller.estimator)
         v_before, v_made = v, step.v
-        if on_sample is not None:
-            on_sample(k)
     for name in ('u', 'true_m', 'true_c_r', 'true_c_l'):  # what no controller can say
         rows[:, COLUMNS.index(name)] = recorded.column(name)
     return RunRecord(rows, recorded.sample_period, recorded.lost_samples,

@@ -24,17 +24,6 @@ def complain(message: str, name: str = 'bringup: ') -> None:
     print(f'{name}{message}', file=sys.stderr, flush=True)
 
 
-def describe(progress: Mapping[str, Any]) -> str:
-    """The estimates with their errors in % of the truth, where that is known."""
-    words = []
-    for name in topics.BACKLASH:
-        estimate, truth = progress.get(name), progress.get(f'true_{name}')
-        words.append(f'{name} {number(estimate)}')
-        if estimate is not None and truth:
-            words[-1] += f' ({100.0 * (estimate - truth) / abs(truth):+.1f} %)'
-    return '  '.join([*words, f'lost {progress.get("lost", 0)}'])
-
-
 @dataclass
 class AxisProgress:
     """How far an axis has come. first: number of the sample that counts as the first.
@@ -87,8 +76,10 @@ class AxisProgress:
             # Every 2 s, and ever more seldom, so that a run of days does not fill the disk.
             self.next_line = self.moved + max(2.0, 0.05 * (self.moved - self.began))
             count = f'{made}/{p.samples}' if p.samples else f'{made}'
-            text = f'{made * p.sample_period:7.2f} s  {count}  {describe(progress)}'
-            complain(self.plan.titled(text), '')
+            words = [f'{made * p.sample_period:7.2f} s', count, *(
+                f'{name} {number(progress.get(name))}' for name in topics.BACKLASH
+            ), f'lost {progress.get("lost", 0)}']
+            complain(self.plan.titled('  '.join(words)), '')
 
     def check_pace(self) -> None:
         """Raise BrokenOffError for samples that do not come."""

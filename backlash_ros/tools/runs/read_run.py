@@ -75,14 +75,12 @@ def find_bag(path: Path) -> Path | None:
     return next((place for place in (path, path / BAG) if is_bag(place)), None)
 
 
-def run_loop(
-    loop: ClosedLoop, samples: int, on_sample: Callable[[int], None] | None = None,
-) -> RunRecord:
+def run_loop(loop: ClosedLoop, samples: int) -> RunRecord:
     """Simulate a run; raises BrokenOffError when its signals grow beyond every number."""
     try:
         # The controller refuses what is not finite: numpy need not say so as well.
         with np.errstate(over='ignore', invalid='ignore', divide='ignore'):
-            return loop.run(samples, on_sample)
+            return loop.run(samples)
     except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
         reason = 'a signal grew beyond every number' if isinstance(error, OverflowError) \
             else ' '.join(str(error).split())

@@ -89,12 +89,6 @@ def test_what_the_user_has_set_reaches_the_nodes(tmp_path, monkeypatch):
     assert environment['ROS_DOMAIN_ID'] == '9'
 
 
-def test_errors_are_in_percent_of_the_truth_where_it_is_known() -> None:
-    event = {'m': 1.43, 'true_m': 1.3, 'c_r': 2.7, 'true_c_r': None, 'c_l': -3.03,
-             'true_c_l': -3.0, 'lost': 2}
-    assert watch.describe(event) == 'm 1.43 (+10.0 %)  c_r 2.7  c_l -3.03 (-1.0 %)  lost 2'
-
-
 def plan(folder: Path, driver: str, *names: str, **values: object) -> RunPlan:
     parameters = effective_parameters(None).replaced({'driver': driver, **values})
     return RunPlan(tuple(
