@@ -182,13 +182,11 @@ def _read_sections(path: Path) -> list[Section]:
         document = yaml.load(path.read_text(encoding='utf-8'), Loader=_StrictLoader)
     except OSError as error:
         raise InputError(f'{path}: cannot be read: {error.strerror}') from None
-    except UnicodeDecodeError:
-        raise InputError(f'{path}: is not a text file in UTF-8') from None
     except yaml.MarkedYAMLError as error:
         line = f' line {error.problem_mark.line + 1}:' if error.problem_mark else ''
         raise InputError(f'{path}:{line} {error.problem}') from None
-    except yaml.YAMLError as error:
-        raise InputError(f'{path}: is not YAML: {" ".join(str(error).split())}') from None
+    except (UnicodeDecodeError, yaml.YAMLError):
+        raise InputError(f'{path}: is not a text file in UTF-8') from None
     try:
         if not isinstance(document, dict) or not document:
             raise InputError('must hold "/**: {ros__parameters: {...}}"')
