@@ -38,14 +38,10 @@ class AxisPlan:
         return self.out / 'logs'
 
     @property
-    def waiting(self) -> set[str]:
-        """Those of its processes that wait for somebody who may come at any time."""
+    def waits(self) -> bool:
+        """Whether it waits for somebody who may come at any time."""
         p = self.parameters
-        return {self.process_name(node) for node, waits in {
-            # The plant begins when the controller listens.
-            'controller': p.driver == ELSEWHERE or not p.autostart, 'plant': not p.autostart,
-            'recorder': p.joints,  # begins when the motion is planned
-        }.items() if waits}
+        return p.driver == ELSEWHERE or not p.autostart or bool(p.joints)
 
     def titled(self, text: str) -> str:
         return f'{self.name}: {text}' if self.name else text

@@ -149,7 +149,12 @@ class RunWatch:
         for child, content in self._supervisor.stop():
             self._note(child, content)
         if not self.failure:
-            self._judge_exits()
+            for child in self._supervisor.children:
+                code = child.process.returncode
+                # How a program of the user says good-bye is its own affair.
+                if code and child.name not in self._gone and (
+                        not child.foreign or code == -signal.SIGKILL):
+                    self._fail(child.describe_end('did not stop cleanly'))
 
     def _fail(self, failure: str) -> None:
         self.failure = failure
@@ -168,7 +173,7 @@ class RunWatch:
                           if not child.foreign and child.name not in self._ready]:
             self._listen()
             late = [child for child in missing if child.name not in self._ready
-                    and child.name not in self.axes[child.axis].plan.waiting]
+                    and not self.axes[child.axis].plan.waits]
             if late and time.monotonic() > deadline:
                 hint = ' (a controller waits until the driver subscribes to its command)' \
                     if any(axis.plan.parameters.driver for axis in self.axes.values()) else ''
@@ -208,19 +213,6 @@ class RunWatch:
         elif kind == 'complaint':
             # The log may lie on the very disk that is full.
             complain(axis.plan.titled(content['text']))
-
-    def _judge_exits(self) -> None:
-        # A driver may end so of the signal that stops it; a shell adds 128 to its number.
-        stopped = -signal.SIGINT, -signal.SIGTERM, 128 + signal.SIGINT, 128 + signal.SIGTERM
-        for child in self._supervisor.children:
-            code = child.process.returncode
-            if code == 0 or child.name in self._gone:
-                continue
-            if not child.foreign or code == -signal.SIGKILL:
-                self._fail(child.describe_end('did not stop cleanly'))
-            elif code not in stopped:
-                # How a program of the user says good-bye is its own affair.
-                complain(child.describe_end('was stopped'))
 
 
 def run(plan: RunPlan, requests: StopRequests) -> RunWatch:
