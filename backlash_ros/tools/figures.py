@@ -163,24 +163,34 @@ def draw_parameter_errors(
     return figure
 
 
-def draw_estimates(run: RunRecord) -> Figure:
-    """Estimates over time with two standard deviations, and the truth where it is known."""
-    t = run.column('t')
-    figure, grid = draw_panels(7.0, {f'${HATS[name]}$ [{BACKLASH_UNITS[name]}]': [
-        *[(t, run.column(f'true_{name}'), HUES['true'], 'true', '-', 6.0, 0.22)] * run.has_truth,
-        (t, run.column(name), HUES[name], 'estimated', '-', 1.8),
-    ] for name in BACKLASH}, frozen_in=run)
-    for axes, name in zip(grid[:, 0], BACKLASH, strict=True):
+def draw_estimates(run: RunRecord, recorded: RunRecord | None = None) -> Figure:
+    """Estimates over time with two standard deviations, and the truth where it is known.
+
+    recorded: of a replay, the run whose estimates, innovation and status are shown instead of it.
+    """
+    t, names = run.column('t'), {f'${HATS[n]}$ [{BACKLASH_UNITS[n]}]': n for n in BACKLASH}
+    beside, known, prefix, wide, own = run, run.has_truth, 'true_', 'true', 'estimated'
+    if recorded is not None:
+        names |= {'innovation [y]': 'innovation', 'status': 'status'}
+        beside, prefix, wide, own = recorded, '', 'run', 'replay'
+        known = bool(np.isfinite(recorded.column('m')[-1]))
+    figure, grid = draw_panels(1.0 + 2.0 * len(names), {text: [
+        *[(t, beside.column(f'{prefix}{name}'), HUES['true'], wide, '-', 6.0, 0.22)] * known,
+        (t, run.column(name), HUES.get(name, HUES['e']), own, '-', 1.8),
+    ] for text, name in names.items()}, frozen_in=run)
+    for axes, name in zip(grid[:, 0], BACKLASH, strict=False):
         estimate, std = run.column(name), 2 * run.column(f'std_{name}')
         title = f'${HATS[name]}$ = {estimate[-1]:.6g}'
         if np.isfinite(std).any():
             band(axes, t, estimate - std, estimate + std, HUES[name], '±2 standard deviations')
             # The first, nearly boundless uncertainty would flatten everything else: the limits
             # are those of the curves, with a margin for the deviations.
-            axes.set_ylim(*limits([estimate, run.column(f'true_{name}')], 0.25))
+            axes.set_ylim(*limits([estimate, beside.column(f'{prefix}{name}')], 0.25))
             title += f' ± {std[-1]:.2g}'
         label(axes, f'{title} at the end')
         legend_above(axes)
+    if recorded is not None:
+        grid[-1, 0].set_yticks([int(state) for state in Status], [state.word for state in Status])
     return figure
 
 

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core.estimate import Status
@@ -119,7 +118,8 @@ def _one(source: Source, out: Path | None) -> None:
     replayed = _replayed(source)
     directory = result_directory(out)
     summary = write_report(Run(replayed, source.parameters), directory)
-    write_atomically(directory / 'replay.png', figures.png(draw_replay(recorded, replayed)))
+    figure = figures.draw_estimates(replayed, recorded)
+    write_atomically(directory / 'replay.png', figures.png(figure))
     print(cli.format_table(('', 'run', 'replay', '±'), [
         (name, cli.number(recorded.column(name)[-1], 6), cli.number(summary['final'][name], 6),
          cli.number(summary['final_std'][name], 2)) for name in BACKLASH
@@ -137,27 +137,6 @@ def _one(source: Source, out: Path | None) -> None:
               f'was {parted.recorded:.6g} and is {parted.replayed:.6g}; by {parted.largest:.3g} '
               'standard deviations at most')
     print(directory / 'replay.png', directory / REPORT_PAGE, sep='\n')
-
-
-def draw_replay(recorded: RunRecord, replayed: RunRecord) -> Figure:
-    """m, c_r, c_l, innovation and status over time; grey: as the run had them."""
-    t, hues = replayed.column('t'), figures.HUES
-    names = {f'${figures.HATS[name]}$ [{figures.BACKLASH_UNITS[name]}]': name for name in BACKLASH}
-    of_log = isnan(recorded.column('m')[-1])
-    figure, grid = figures.draw_panels(10.0, {
-        text: [*[(t, recorded.column(name), hues['y_m'], 'run', '-', 2.6)] * (not of_log),
-               (t, replayed.column(name), hues.get(name, hues['e']), 'replay')]
-        for text, name in {**names, 'innovation [y]': 'innovation', '': 'status'}.items()
-    }, height_ratios=[1.0, 1.0, 1.0, 1.0, 0.5])
-    for axes, name in zip(grid[:, 0], BACKLASH, strict=False):
-        again, std = replayed.column(name), replayed.column(f'std_{name}')
-        figures.band(axes, t, again - std, again + std, hues[name])
-        low, high = np.nanpercentile(np.concatenate([recorded.column(name), again]), [1.0, 99.0])
-        room = 0.2 * (high - low) or 0.1 * max(abs(high), 1e-9)
-        axes.set_ylim(low - room, high + room)
-    figures.legend_above(grid[0, 0])
-    grid[-1, 0].set_yticks([int(state) for state in Status], [state.word for state in Status])
-    return figure
 
 
 main = partial(cli.run_tool, 'replay', _replay)
