@@ -1,7 +1,7 @@
 """What every command line has in common: exit codes, errors in one line, numbers, shipped files."""
 
 import argparse
-import importlib
+import os
 import sys
 from math import inf
 from pathlib import Path
@@ -60,13 +60,10 @@ def find_config(config: Path | None) -> Path:
     """Path of a configuration file: as given, or among the shipped ones; None: the paper's."""
     if config is not None and (config.exists() or config.parent != Path()):
         return config
-    package, given = 'backlash_ros', config or Path(DEFAULT_CONFIG)
+    given = config or Path(DEFAULT_CONFIG)
+    prefixes = [*os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep), sys.prefix]
     # The source tree first: beside the code that runs lies the configuration written for it.
-    folders = [Path(__file__).resolve().parents[1], Path(sys.prefix) / 'share' / package]
-    try:
-        ament_index = importlib.import_module('ament_index_python.packages')
-        folders.insert(1, Path(ament_index.get_package_share_directory(package)))
-    except (ImportError, LookupError, OSError):
-        pass  # no ament index here, or the package is not in it
+    folders = [Path(__file__).resolve().parents[1],
+               *(Path(prefix) / 'share' / 'backlash_ros' for prefix in filter(None, prefixes))]
     files = (folder / 'config' / given.name for folder in folders)
     return next(filter(Path.exists, files), given)
