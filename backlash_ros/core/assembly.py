@@ -1,7 +1,5 @@
 """From checked parameters to the objects of the core: the one place that knows both."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
 

@@ -1,7 +1,5 @@
 """Estimates in a file, so that a controller that is restarted need not learn from nothing."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from math import inf, isfinite, isnan, nan

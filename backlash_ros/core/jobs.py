@@ -4,8 +4,6 @@ A job is a pure function of a record and of whatever else it is given. The loop 
 channel, submits one job at a time, and polls for its result; none of the three waits for a job.
 """
 
-from __future__ import annotations
-
 import os
 import pickle
 import signal
@@ -59,7 +57,7 @@ class SampleBuffer:
             del self.values[:(first - self.first) * self.quantities]
             self.first = first
 
-    def values_between(self, first: int, end: int) -> array[float]:
+    def values_between(self, first: int, end: int) -> 'array[float]':
         begin, stop = ((k - self.first) * self.quantities for k in (first, max(end, first)))
         return self.values[begin:stop]
 
@@ -79,7 +77,7 @@ class Channel:
     from the one to before the other number.
     """
 
-    def __init__(self, executor: Executor, number: int, quantities: int, capacity: int) -> None:
+    def __init__(self, executor: 'Executor', number: int, quantities: int, capacity: int) -> None:
         self.busy, self.number, self.record = False, number, SampleBuffer(quantities)
         self.since = self.end = 0
         self.result: Any = None

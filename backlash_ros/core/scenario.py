@@ -3,8 +3,6 @@
 Apart from assembly.py, so that the nodes for these start without loading what learns and controls.
 """
 
-from __future__ import annotations
-
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.actuator import Actuator
 from backlash_ros.core.plant.simulated_plant import SimulatedPlant, altered_plant, delayed

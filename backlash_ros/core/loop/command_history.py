@@ -1,7 +1,5 @@
 """Which v acted over each sample interval: told from commands, from reports, or both."""
 
-from __future__ import annotations
-
 from collections import deque
 from math import inf, nan, sqrt
 

@@ -1,7 +1,5 @@
 """From an output to a command: count → learn → control → limit → send → tell."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

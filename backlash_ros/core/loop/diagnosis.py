@@ -1,7 +1,5 @@
 """Why the loop is not well: one table of conditions over what was counted, and their log."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
@@ -171,7 +169,7 @@ class LoopFigures(Counts):
 
 
 def figures_of_loop(
-    loop: ControlLoop, p: Parameters, timing: Timing, gained: Mapping[str, int],
+    loop: 'ControlLoop', p: Parameters, timing: Timing, gained: Mapping[str, int],
     around: Neighbours,
 ) -> LoopFigures:
     """What is known of a loop. gained: counts lately."""

@@ -1,7 +1,5 @@
 """The loops of all joints of an arm: one sampling clock, one message of commands."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import cycle

@@ -1,7 +1,5 @@
 """What a controller believes of G: the coefficients, how sure they are, the noise, the rest."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import nan

@@ -1,7 +1,5 @@
 """What the controller counts about its loop."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields

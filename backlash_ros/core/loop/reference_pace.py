@@ -1,7 +1,5 @@
 """When y_m leaves, and for which sample: paced by plant_output, by the own clock without it."""
 
-from __future__ import annotations
-
 from math import inf
 
 from backlash_ros.core.loop.sample_counter import JITTER

@@ -1,7 +1,5 @@
 """Which sample of the plant a message holds, how many were skipped, and when a driver samples."""
 
-from __future__ import annotations
-
 from collections import deque
 from itertools import islice, pairwise
 from math import isfinite, nan, sqrt

@@ -3,8 +3,6 @@
 table.py declares every parameter, parameter.py says how one is checked.
 """
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Iterable, Iterator, Mapping
 from math import hypot, sqrt
@@ -49,7 +47,7 @@ class Parameters(ParameterTree, Mapping[str, Value]):
     joint_names: tuple[str, ...]
     given: dict[str, object]
     _values: dict[str, Any]
-    _of_joints: dict[str, Parameters]
+    _of_joints: dict[str, 'Parameters']
 
     def __init__(self, values: Mapping[str, object] | None = None) -> None:
         """Take given values and the defaults of all others; raises ParameterError."""
@@ -79,7 +77,7 @@ class Parameters(ParameterTree, Mapping[str, Value]):
         self._values, self.given, self.joint_names = checked, given, joints or ('',)
         self._of_joints = {joint: _of_joint(joint, shared, own[joint]) for joint in joints}
 
-    def of_joint(self, joint: str) -> Parameters:
+    def of_joint(self, joint: str) -> 'Parameters':
         return self._of_joints[joint] if self._of_joints else self
 
     def __getitem__(self, name: str) -> Value:
@@ -92,7 +90,7 @@ class Parameters(ParameterTree, Mapping[str, Value]):
     def __len__(self) -> int:
         return len(self._values)
 
-    def replaced(self, changes: Mapping[str, object]) -> Parameters:
+    def replaced(self, changes: Mapping[str, object]) -> 'Parameters':
         """A new set with some values changed, defaults staying defaults; raises ParameterError."""
         return Parameters({**self.given, **changes})
 

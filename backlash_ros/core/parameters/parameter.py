@@ -1,7 +1,5 @@
 """What is declared of a parameter, and the check of a value against it."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field

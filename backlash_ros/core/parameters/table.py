@@ -4,8 +4,6 @@ To add one, add a field: name, type, default, sentence, unit, rules (see Paramet
 is then its value in a set of Parameters, and `control.max` its name everywhere else.
 """
 
-from __future__ import annotations
-
 from functools import partial
 from math import inf
 from typing import NamedTuple
