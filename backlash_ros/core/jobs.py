@@ -13,6 +13,7 @@ import time
 from array import array
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from queue import SimpleQueue
@@ -80,7 +81,7 @@ class Channel:
     def __init__(self, executor: 'Executor', number: int, quantities: int, capacity: int) -> None:
         self.busy, self.number, self.record = False, number, SampleBuffer(quantities)
         self.since = self.end = 0
-        self.result: Any = None
+        self.result: Callable[[], Any] | None = None  # once it is there
         self._executor, self._capacity = executor, capacity
 
     def append(self, *values: float) -> None:
@@ -105,7 +106,7 @@ class Channel:
         """The result of the job, or its Failure, once it is finished; None before."""
         result, self.result = self.result, None
         self.busy = self.busy and result is None
-        return result
+        return result and result()
 
     def close(self) -> None:
         self._executor.forget(self)
@@ -125,7 +126,8 @@ class Executor:
         return Channel(self, 0, quantities, capacity)
 
     def begin(self, channel: Channel, job: Job, args: tuple[Any, ...]) -> None:
-        channel.result = _computed(job, channel.record, channel.since, channel.end, args)
+        result = _computed(job, channel.record, channel.since, channel.end, args)
+        channel.result = lambda: result
 
     def forget(self, channel: Channel) -> None:
         channel.record = SampleBuffer(channel.record.quantities)
@@ -206,13 +208,17 @@ class WorkerExecutor(Executor):
                     pickle.dump((channel.number, [*self._channels], samples, job), worker.stdin, -1)
                     worker.stdin.flush()
                     asked, sent[channel.number] = True, channel.end
-                    channel.result = pickle.load(worker.stdout)
-                    deaths = 0
-                except (OSError, EOFError, pickle.UnpicklingError):
+                    size = int.from_bytes(worker.stdout.read(8), 'little')
+                    body = worker.stdout.read(size)
+                    if not 0 < size == len(body):
+                        raise EOFError
+                    # Not here, where it would keep the loop waiting.
+                    channel.result, deaths = partial(pickle.loads, body), 0
+                except (OSError, EOFError):
                     self._worker, sent, deaths = None, {}, deaths + 1
                     self.restarts += 1
                     if asked:
-                        channel.result = Failure(LOST)
+                        channel.result = partial(Failure, LOST)
                     _end(worker)
                     # At once, but where it died like the one before it: longer each time.
                     wait_s = min(0.1 * 2.0 ** min(deaths - 2, 7), 10.0) if deaths > 1 else 0.0
@@ -276,7 +282,8 @@ def serve(preload: Sequence[str] = ()) -> None:
         if number not in records or records[number].end != first:
             records[number] = SampleBuffer(quantities, first)
         records[number].values.frombytes(block)
-        results.write(_result_of(job, records[number]))
+        result = _result_of(job, records[number])
+        results.write(len(result).to_bytes(8, 'little') + result)
         results.flush()
         records = {number: record for number, record in records.items() if number in still_open}
         earned = share * max(sum(record.quantities > 0 for record in records.values()), 1)

@@ -75,7 +75,7 @@ def wait_for_event(
 def check_running(supervisor: ProcessSupervisor) -> None:
     """Raise RuntimeError if a process has ended."""
     for child in supervisor.children:
-        if child.has_ended:
+        if child.process.poll() is not None:
             raise RuntimeError(f'{child.name} ended: {child.end_of_log()}')
 
 

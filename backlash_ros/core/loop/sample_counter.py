@@ -21,15 +21,11 @@ CLOCK_SLACK = 0.01  # share of a period by which the sender's clock may run slow
 
 
 class Period(NamedTuple):
-    """Mean period of the driver, its standard deviation, the median interval [s]; nan: not known.
-
-    scatter: standard deviation of the stamps around their even spacing [s].
-    """
+    """Mean period of a driver, its standard deviation, the median interval [s]; nan: unknown."""
 
     mean: float = nan
     std: float = nan
     median: float = nan
-    scatter: float = nan
 
     def differs_from(self, nominal_s: float, tolerance: float) -> bool:
         """Whether it certainly is off by more than a share, and the median interval likewise."""
@@ -54,7 +50,7 @@ class Timing(NamedTuple):
     @property
     def is_stretched(self) -> bool:
         """Whether pauses make the period longer, as the median interval is not."""
-        mean, std, *_ = self.period
+        mean, std, _ = self.period
         return mean - self.nominal_s > 0.01 * self.nominal_s + 3.0 * std \
             and not self.period.differs_from(self.nominal_s, 0.01)
 
@@ -156,7 +152,7 @@ class DriverPeriod:
             return Period()
         # A process that is held up is late for some ten samples, whose lateness is one error.
         std = sqrt(max(10.0 / apart, 1.0) * rest / spread)
-        return Period(slope, std, float(ordered[len(ordered) // 2]), sqrt(rest))
+        return Period(slope, std, float(ordered[len(ordered) // 2]))
 
 
 def _numbered(times: list[float], period_s: float) -> list[float]:
