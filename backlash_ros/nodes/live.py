@@ -111,26 +111,22 @@ class LiveNode(ProcessNode):
             emit('ready', address=self._server.address)
         else:
             print(self._server.address, flush=True)
-        due_s = time.monotonic()
         while not self.stopping:
             executor.spin_once(timeout_sec=0.0)  # the look for further controllers
             self._followed.take_messages()
             states, now_s = self._followed.by_name, time.monotonic()
+            curves: dict[str, dict[str, list[object]]] = {name: {} for name in states}
+            for name, state in states.items():
+                for label, at_ns, value in state.watched:
+                    point = self._seconds(at_ns), rounded(value)
+                    curves[name].setdefault(label, []).append(point)
             self._server.add({
                 'now': self._seconds(time.time_ns()), 'shown': self._shown_s,
                 'awaited': self._followed.awaited,
                 'controllers': [content_of(states[name], now_s) for name in sorted(states)],
-            }, {name: self._points_of(state) for name, state in states.items()})
-            now_s = time.monotonic()
-            due_s = max(due_s + PAGE_PERIOD_S, now_s)
-            time.sleep(due_s - now_s)
+            }, curves)
+            time.sleep(PAGE_PERIOD_S)
         self._server.shutdown()
-
-    def _points_of(self, state: followed.ControllerState) -> dict[str, list[object]]:
-        points: dict[str, list[object]] = {}
-        for label, at_ns, value in state.watched:
-            points.setdefault(label, []).append((self._seconds(at_ns), rounded(value)))
-        return points
 
     def _seconds(self, at_ns: int) -> float:
         return round(1e-9 * (at_ns - self._start_ns), 6)

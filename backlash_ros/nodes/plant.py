@@ -54,16 +54,10 @@ class PlantNode(ProcessNode):
         )
         self._truth_rows: list[tuple[float, ...]] = []  # that wait until y has left
         self.listen(Float64, topics.CONTROL, self._on_control, 1)
-        name, outputs, wanted = \
-            self.resolve_topic_name, topics.PLANT_OUTPUT, p.wait_for_subscribers
-        self.log.info(
-            f'started: {name(topics.CONTROL)} in, {name(outputs)} out, '
-            f'sample_period {p.sample_period:g} s ({1.0 / p.sample_period:.4g} Hz)'
-            + (f'; waits for {wanted} subscribers of {outputs}' if wanted else '')
-        )
-        self.start_when(
-            self._is_heard, self._offer if p.lockstep else lambda: None, f'subscribers of {outputs}'
-        )
+        name, start = self.resolve_topic_name, self._offer if p.lockstep else lambda: None
+        self.log.info(f'started: {name(topics.CONTROL)} in, {name(topics.PLANT_OUTPUT)} out, '
+                      f'sample_period {p.sample_period:g} s')
+        self.start_when(self._is_heard, start, f'subscribers of {topics.PLANT_OUTPUT}')
 
     def _is_heard(self) -> bool:
         """Whether enough listen; one of several is a recorder, which wants everything."""
@@ -124,10 +118,8 @@ class PlantNode(ProcessNode):
                 executor.look_if_due()
             elif remaining >= 3_000_000:  # a wait of the executor costs more than less leaves
                 executor.spin_once(timeout_sec=remaining * 1e-9)
-            elif self._expecting:
-                executor.serve_urgent(int(remaining))
             else:
-                time.sleep(remaining * 1e-9)
+                executor.serve_urgent(int(remaining))
 
     def _on_tick(self, passed: int, due_ns: int) -> None:
         """Simulate the periods that have passed, the last one until due_ns, and publish y."""

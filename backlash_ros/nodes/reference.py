@@ -40,18 +40,14 @@ class ReferenceNode(ProcessNode):
         self._output = self.create_publisher(
             Float64, topics.REFERENCE, messages.KEPT_QOS if p.lockstep else messages.DEPTH
         )
-        name, awaited = self.resolve_topic_name, \
-            f'{p.wait_for_subscribers} subscribers of {topics.REFERENCE}'
-        self.log.info(
-            f'started: {name(self._io.topics.output)} in, {name(topics.REFERENCE)} out: '
-            f'{p.waveform}, sample_period {p.sample_period:g} s'
-            + (f'; waits for {awaited}' if p.wait_for_subscribers else '')
-        )
+        name = self.resolve_topic_name
+        self.log.info(f'started: {name(self._io.topics.output)} in, {name(topics.REFERENCE)} out: '
+                      f'{p.waveform}, sample_period {p.sample_period:g} s')
         self.start_when(
             lambda: self._output.get_subscription_count() >= p.wait_for_subscribers,
             lambda: p.lockstep and self.create_subscription(
                 Clock, topics.CLOCK, self._on_clock, messages.KEPT_QOS
-            ), awaited,
+            ), f'{p.wait_for_subscribers} subscribers of {topics.REFERENCE}',
         )
 
     def work(self, executor: PromptExecutor) -> None:
