@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import partial
-from math import inf, isfinite, nan
+from math import inf, nan
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -27,8 +27,8 @@ from backlash_ros.topics import BACKLASH, DIAGNOSTICS
 class ControllerState:
     """One controller, or a joint of it.
 
-    estimates: value and half width of its band of two deviations. scales: the largest magnitudes
-    that were shown. watched: label, time of arrival [ns] and value of what came at the last look.
+    estimates: value and half width of its band of two deviations. watched: label, time of arrival
+    [ns] and value of what came at the last look.
     """
 
     def __init__(self, node: str, joint: str = '') -> None:
@@ -40,7 +40,6 @@ class ControllerState:
         self.heard_at_s = -inf  # on the steady clock
         self.values: dict[str, str] = {}
         self.estimates = dict.fromkeys(BACKLASH, (nan, nan))
-        self.scales = dict.fromkeys(BACKLASH, 0.0)
         self.events: deque[tuple[str, str]] = deque(maxlen=20)
 
     def hear(self, status: DiagnosticStatus, now_s: float) -> None:
@@ -53,17 +52,12 @@ class ControllerState:
         self.heard_at_s = now_s
         self.values = {pair.key: pair.value for pair in status.values}
         for name in BACKLASH:
-            self._set_estimate(name, self.number(name), 2.0 * self.number(f'std_{name}'))
+            self.estimates[name] = self.number(name), 2.0 * self.number(f'std_{name}')
 
     def hear_value(self, label: str, message: Float64, info: dict[str, Any]) -> None:
         self.watched.append((label, info['received_timestamp'], message.data))
         if label in BACKLASH:
-            self._set_estimate(label, message.data, self.estimates[label][1])
-
-    def _set_estimate(self, name: str, value: float, half_width: float) -> None:
-        self.estimates[name] = (value, half_width)
-        if isfinite(value):
-            self.scales[name] = max(self.scales[name], abs(value))
+            self.estimates[label] = message.data, self.estimates[label][1]
 
     def note(self, text: str) -> None:
         self.events.append((time.strftime('%H:%M:%S'), text))

@@ -201,7 +201,7 @@ def _panel(
     # Often the cure stands in the second line.
     lines = [*wrap(state.message, inner), '', ''][:2]
     for name in BACKLASH:
-        end = axis_end(state.scales[name])
+        end = axis_end(abs(state.estimates[name][0]))
         axis = f' {"-" if name == "c_l" else ""}{end:g}' if end else ''
         before = f'{name:<4}{_with_band(state, name, 11)}'.ljust(32)
         room = max(inner - len(before) - len(axis), 0)
