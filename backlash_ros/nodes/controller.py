@@ -14,7 +14,6 @@ from typing import Any
 
 from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
-from rclpy.subscription import Subscription
 from rclpy.time import Time
 from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock
@@ -80,7 +79,6 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
         # Lockstep: ticks of /clock [ns], references and outputs that wait for each other.
         self._waiting: tuple[deque[int], deque[float], deque[Output]] = deque(), deque(), deque()
         self._around: tuple[Neighbours, Timing] | None = None  # at the newest look at the graph
-        self._driver: Subscription | None = None  # plant_output, once it may begin
         self._ending: Timer | None = None  # sends the commands of on_timeout
         to = self._io.topics
         self._rivals = RivalWatch(self, self._io, self._mind_rivals)
@@ -146,7 +144,7 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         self._rivals.begin(active=True)
-        if self._driver is not None:
+        if self._io.topics.output in self._io.heard:
             # v goes on from the last command, but what the plant did meanwhile is unknown, and
             # that nobody was listened to is no silence of the driver.
             for loop in self.configured:
@@ -183,11 +181,11 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
 
         def listen() -> None:
             # Whoever is activated twice before everybody is there has two that wait.
-            if self._driver is None:
+            if io.topics.output not in io.heard:
                 self._rivals.look()
                 self._steps.look()
                 kept = sample_counter.kept_outputs(self.settings.sample_period)
-                self._driver = io.listen(self._on_output, min(kept, DEPTH))
+                io.listen(self._on_output, min(kept, DEPTH))
                 emit('ready')
 
         self.call_when(

@@ -16,7 +16,7 @@ import tty
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from io import TextIOWrapper
-from math import floor, isfinite, isnan, log10
+from math import isfinite
 from textwrap import wrap
 from typing import Any
 
@@ -38,7 +38,6 @@ ACTIONS = {
     'f': ('freeze_adaptation', 'learning'), 'c': ('enable_compensation', 'compensating'),
     'r': ('reset_estimates', ''), 's': ('save_estimates', ''),
 }
-BAR = '█▒·'  # sure, within the band, beyond it
 
 
 class MonitorNode(ProcessNode):
@@ -138,28 +137,6 @@ class MonitorNode(ProcessNode):
             self.destroy_client(client)
 
 
-def bar(value: float, half_width: float, scale: float, width: int) -> str:
-    """A bar from 0 to |value| on an axis that ends at `scale`, its band in another shade."""
-    if not isfinite(value) or not scale > 0.0:
-        return ' ' * width
-    half = 0.0 if isnan(half_width) else half_width
-    begins, ends = (
-        round(width * min(max(x / scale, 0.0), 1.0)) for x in (abs(value) - half, abs(value) + half)
-    )
-    if half > 0.0 and begins == ends:
-        begins = max(begins - 1, 0)
-        ends = begins + 1
-    return BAR[0] * begins + BAR[1] * (ends - begins) + BAR[2] * (width - ends)
-
-
-def axis_end(largest: float) -> float:
-    """The next of 1, 2, 5, 10, 20, ... above 1.1 times the largest magnitude; 0 without one."""
-    if not largest > 0.0:
-        return 0.0
-    power = 10.0 ** floor(log10(1.1 * largest))
-    return next(step * power for step in (1.0, 2.0, 5.0, 10.0) if step * power >= 1.1 * largest)
-
-
 def screen(
     states: Sequence[ControllerState], selected: int, notice: str, now_s: float, width: int,
     height: int,
@@ -200,12 +177,7 @@ def _panel(
     colour = 'red' if state.silent_s(now_s) else ('green', 'yellow', 'red')[state.level]
     # Often the cure stands in the second line.
     lines = [*wrap(state.message, inner), '', ''][:2]
-    for name in BACKLASH:
-        end = axis_end(abs(state.estimates[name][0]))
-        axis = f' {"-" if name == "c_l" else ""}{end:g}' if end else ''
-        before = f'{name:<4}{_with_band(state, name, 11)}'.ljust(32)
-        room = max(inner - len(before) - len(axis), 0)
-        lines.append(before + bar(*state.estimates[name], end, room) + axis)
+    lines += [f'{name:<4}{_with_band(state, name, 11)}' for name in BACKLASH]
     lines += [
         f'excitation {state.excitation:.3g} gaps   {number("rate [Hz]"):.4g} Hz   '
         f'latency {number("latency p50 [ms]"):.3g} ms, p99 {number("latency p99 [ms]"):.3g} ms',

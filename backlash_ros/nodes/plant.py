@@ -38,8 +38,7 @@ class PlantNode(ProcessNode):
         # The same draws as in a simulation in one process, so that runs agree to the last bit.
         self._loss_rng = np.random.default_rng([p.seed, 1])
         self._held = HeldControl()  # times of arrival on the monotonic clock
-        self._heard = self._expecting = False  # a first v; none since the newest output
-        self._counts: Counter[str] = Counter()
+        self._expecting = False  # no v has come since the newest output
         self._published: Counter[str] = Counter()  # what a recorder can have heard
         self._outgoing = {
             topic: self.create_publisher(Float64, topic, messages.DEPTH)
@@ -82,16 +81,14 @@ class PlantNode(ProcessNode):
         super().work(executor)
 
     def finish(self) -> None:
-        counts = ', '.join(f'{count} {what}' for what, count in self._counts.items() if count)
-        self.log.info(f'{self._plant.sample} samples' + (f', {counts}' if counts else ''))
+        self.log.info(f'{self._plant.sample} samples')
 
     def _on_control(self, message: Float64, info: dict[str, Any]) -> None:
         v = message.data
         if not isfinite(v):
-            self._counts['non-finite controls dropped'] += 1
             return
         self._held.take(v, messages.arrival_ns(info['received_timestamp']))
-        expected, self._expecting, self._heard = self._expecting, False, True
+        expected, self._expecting = self._expecting, False
         if expected and self.settings.lockstep:
             self._advance(v)
             self._offer()
@@ -123,8 +120,6 @@ class PlantNode(ProcessNode):
 
     def _on_tick(self, passed: int, due_ns: int) -> None:
         """Simulate the periods that have passed, the last one until due_ns, and publish y."""
-        self._counts['late controls'] += self._expecting and self._heard
-        self._counts['missed outputs'] += max(passed - 1, 0)
         period_ns = self.settings.sample_period * 1e9
         # Of the intervals that ended while the process was held up, some were over before v came.
         for missed in reversed(range(passed)):
@@ -151,7 +146,6 @@ class PlantNode(ProcessNode):
         if sample > 0 and p.output_loss > 0.0 and float(self._loss_rng.random()) < p.output_loss:
             return False
         if time.monotonic_ns() > latest_ns:
-            self._counts['missed outputs'] += 1
             return False
         self._expecting = True
         if p.lockstep:

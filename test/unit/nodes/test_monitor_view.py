@@ -3,14 +3,14 @@
 import re
 from collections.abc import Mapping
 from io import StringIO
-from math import inf, nan
+from math import inf
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from rich.console import Console
 
 from backlash_ros.nodes.followed import ControllerState
-from backlash_ros.nodes.monitor import bar, screen
+from backlash_ros.nodes.monitor import screen
 
 VALUES = {
     'state': 'tracking', 'm': '1.3', 'c_r': '3', 'c_l': '-3', 'std_m': '0.1', 'std_c_r': '0.2',
@@ -44,13 +44,6 @@ def shown(states: list[ControllerState], **changes: object) -> list[str]:
     console.print(screen(states, **arguments))  # type: ignore[arg-type]
     assert isinstance(console.file, StringIO)
     return console.file.getvalue().rstrip('\n').split('\n')
-
-
-def test_a_bar_ends_at_the_value_and_shades_the_band() -> None:
-    assert bar(5.0, 1.0, 10.0, 10) == '████▒▒····'
-    assert bar(-5.0, nan, 10.0, 10) == '█████·····'
-    assert bar(5.0, 1e-9, 10.0, 10) == '████▒·····'
-    assert (bar(0.0, 1e-9, 10.0, 10), bar(nan, 1.0, 10.0, 10)) == ('▒·········', ' ' * 10)
 
 
 def test_state_estimates_and_figures_are_shown() -> None:
