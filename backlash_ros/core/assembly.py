@@ -56,9 +56,8 @@ def law_fits(law: str, structure: str) -> bool:
     return law not in ONLY_IN or ONLY_IN[law][0] == structure
 
 
-def build_controller(
-    p: Parameters, estimate: Estimate | None = None, executor: Executor | None = None,
-) -> AdaptiveController:
+def build_controller(p: Parameters, estimate: Estimate | None = None,
+                     executor: Executor | None = None) -> AdaptiveController:
     """The controller with the law and the structure that the parameters name.
 
     estimate: to begin with, None for those that were known before. executor: where fits and gains

@@ -128,9 +128,8 @@ class CommandHistory:
     left, own or of another controller. output_ns: stamp of the newest output that was used.
     """
 
-    def __init__(
-        self, sample_period_s: float, use: str = 'true', counts: LoopStatistics | None = None,
-    ) -> None:
+    def __init__(self, sample_period_s: float, use: str = 'true',
+                 counts: LoopStatistics | None = None) -> None:
         self.counts = counts or LoopStatistics()
         self.trust, self.origin = ReportTrust(use), ReportOrigin()
         self.newest_ns = self.output_ns = 0
@@ -226,9 +225,8 @@ class HeldControl:
         return self.newest if self._arrived_ns < ended_ns else self._before
 
 
-def v_of_intervals(
-    index: NDArray[np.int64], output_ns: Stamps, command_ns: Stamps, v: Array, reported: bool,
-) -> Array:
+def v_of_intervals(index: NDArray[np.int64], output_ns: Stamps, command_ns: Stamps, v: Array,
+                   reported: bool) -> Array:
     """v over the interval after each sample, shape (N,), N = index[-1] + 1; nan before any v.
 
     index: number of each sample whose y was heard, rising from 0. output_ns: stamps of these y.

@@ -140,9 +140,8 @@ class ControlLoop:
         else:
             self.statistics.bad_reports += 1
 
-    def answer(
-        self, output: Output, arrival: Arrival | None = None, y_m: float | None = None,
-    ) -> ControlStep | None:
+    def answer(self, output: Output, arrival: Arrival | None = None,
+               y_m: float | None = None) -> ControlStep | None:
         """Count y(k), learn from it, and send v(k); None where the message brings no command.
 
         arrival: of an output that was counted already. y_m: None for the newest one.
@@ -155,8 +154,7 @@ class ControlLoop:
         self.send(step.v)
         self.statistics.note(
             output.y, step.v, self.core.inverse.limited,
-            step.estimate.status is Status.INCONSISTENT, (time.time_ns() - output.sent_ns) * 1e-9,
-        )
+            step.estimate.status is Status.INCONSISTENT, (time.time_ns() - output.sent_ns) * 1e-9)
         return step
 
     def skip(self, arrival: Arrival) -> None:
@@ -206,8 +204,7 @@ class ControlLoop:
     def _may_answer(self, output: Output) -> bool:
         """Begin anew where too much is missing; returns whether a v to go on from is known."""
         p, gap = self._p, self._gap
-        stalled = not p.lockstep \
-            and 0.0 < p.timeout.plant_output < gap.missing * p.sample_period
+        stalled = not p.lockstep and 0.0 < p.timeout.plant_output < gap.missing * p.sample_period
         too_long = self.phase is Phase.RUNS and (gap.missing > LONGEST_GAP or stalled)
         if self.silent or gap.restarted or too_long:
             self.statistics.interruptions += 1
@@ -253,10 +250,8 @@ class ControlLoop:
         # Late commands are counted even where the driver says which ones it applied.
         acted, others = commands.over(lost + 1, stamp_ns, self.counter.due_ns)
         reports = commands.reported_over(lost + 1, stamp_ns, unsent)
-        origin = commands.origin
-        if reports and origin.changed_by(
-            reports[-1] + origin.value, acted[-1] / core.command_of(1.0), self.estimate
-        ):
+        origin, told = commands.origin, acted[-1] / core.command_of(1.0)
+        if reports and origin.changed_by(reports[-1] + origin.value, told, self.estimate):
             self.driver.warn(f'{self.driver.applied} is {origin.value:.4g} beyond v: taken for '
                              'another zero of the motor encoder, and subtracted')
             self.renew(origin.before)
@@ -333,9 +328,8 @@ class ControlLoop:
         core.inverse.direction_band = p.inverse.direction_band
         core.inverse.take_up = p.inverse.take_up_rate * p.sample_period
         core.estimator.retune(p)
-        if any(p[name] != before[name] for name in (
-            'tracking.input_weight', 'tracking.integral_weight', 'inverse.caution', NOISE,
-        )):
+        used = 'tracking.input_weight', 'tracking.integral_weight', 'inverse.caution', NOISE
+        if any(p[name] != before[name] for name in used):
             structure = build_structure(p)
             structure.go_on_from(core.structure)
             core.structure = structure

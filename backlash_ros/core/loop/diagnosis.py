@@ -168,10 +168,8 @@ class LoopFigures(Counts):
         return self.used + self.without_reference + self.bad_outputs
 
 
-def figures_of_loop(
-    loop: 'ControlLoop', p: Parameters, timing: Timing, gained: Mapping[str, int],
-    around: Neighbours,
-) -> LoopFigures:
+def figures_of_loop(loop: 'ControlLoop', p: Parameters, timing: Timing,
+                    gained: Mapping[str, int], around: Neighbours) -> LoopFigures:
     """What is known of a loop. gained: counts lately."""
     statistics, estimate, law = loop.statistics, loop.estimate, loop.core.estimator
     # Hardware on topics falls silent where all joints are where they belong.
@@ -184,8 +182,7 @@ def figures_of_loop(
         timing=Timing(p.sample_period) if p.lockstep else timing,
         learning=Learning(
             estimate.status if statistics.used else None, law.report,
-            statistics.inconsistent * p.sample_period, law.adapting, was_given(estimate),
-        ),
+            statistics.inconsistent * p.sample_period, law.adapting, was_given(estimate)),
         standing_down=loop.standing_down, on_timeout=p.on_timeout,
         silent_s=p.timeout.plant_output if loop.silent else 0.0,
         reference_silent_s=p.timeout.reference * unreferred if isfinite(loop.heard.y_m) else inf,

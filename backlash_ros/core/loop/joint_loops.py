@@ -40,9 +40,8 @@ class JointLoops:
         pause = max(round(0.05 / p.sample_period / len(self.loops)), 1)  # samples
         self.turns = cycle([turn for loop in self.loops for turn in (loop, *[None] * (pause - 1))])
 
-    def answer(
-        self, outputs: Mapping[str, Output], y_m: float | None = None,
-    ) -> dict[str, ControlStep]:
+    def answer(self, outputs: Mapping[str, Output],
+               y_m: float | None = None) -> dict[str, ControlStep]:
         """Send v(k) for y(k) of all joints that there are; returns the steps that were made."""
         arrival = self.counter.count(*next(iter(outputs.values())).counted)
         if self._together and any(

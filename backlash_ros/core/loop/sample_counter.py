@@ -222,10 +222,8 @@ class SampleCounter:
         self._on_time = 0  # samples that came when they were due, less the early ones
         self._strange = 0  # messages in a row that do not follow the newest sample
 
-    def count(
-        self, stamp_ns: int, sequence: int = UNNUMBERED, numbered: bool = True,
-        received_ns: int = 0,
-    ) -> Arrival:
+    def count(self, stamp_ns: int, sequence: int = UNNUMBERED, numbered: bool = True,
+              received_ns: int = 0) -> Arrival:
         """Take in a message and say what it is; the arguments are those of Output."""
         known = sequence != UNNUMBERED
         numbered = numbered and known
@@ -295,9 +293,8 @@ class SampleCounter:
         early = self._early_ns + period * (1 + missing + CLOCK_SLACK)
         self._early_ns = max(min(early, stamp_ns), self.due_ns - 0.5 * period)
 
-    def _of_another(
-        self, stamp_ns: int, sequence: int, missing: int = 0, at_once: bool = False,
-    ) -> Arrival:
+    def _of_another(self, stamp_ns: int, sequence: int, missing: int = 0,
+                    at_once: bool = False) -> Arrival:
         """Another sender, or a clock that was set back: mostly believed after some messages."""
         self._strange += 1
         if self._strange < 5 and not at_once:

@@ -66,9 +66,8 @@ class Parameter:
         return ' and '.join(f'{sign} {bound:g}' for sign, bound in bounds if isfinite(bound))
 
 
-def option(
-    default: Any, description: str, unit: str = '', choices: Iterable[str] = (), **rules: Any,
-) -> Any:
+def option(default: Any, description: str, unit: str = '', choices: Iterable[str] = (),
+           **rules: Any) -> Any:
     """What a group says of a parameter, in place of its default; rules: fields of Parameter.
 
     choices: words; 'OLD=NEW' is one that stands for another.
@@ -91,9 +90,8 @@ def declared_in(group: type[Any], prefix: str = '') -> Iterator[Parameter]:
             yield from declared_in(kind, f'{prefix}{name}.')
 
 
-def attributes_of(
-    group: type[Any], values: Mapping[str, Value], prefix: str = '',
-) -> dict[str, Any]:
+def attributes_of(group: type[Any], values: Mapping[str, Value],
+                  prefix: str = '') -> dict[str, Any]:
     """Those of a group, from the values of its parameters by their names."""
     return {
         name: values[prefix + name] if prefix + name in values
@@ -119,7 +117,7 @@ def check_value(parameter: Parameter, value: object) -> Value:
     """Return value in the type of the parameter; raises ParameterError."""
     default, refused = parameter.default, partial(ParameterError, parameter.name)
     if isinstance(default, tuple):
-        return _names(parameter, value) if parameter.names else _numbers(parameter, value)
+        return _checked_list(parameter, value)
     if isinstance(default, bool) or 'true' in parameter.choices:
         # YAML and ROS 2 take true and false for more than words.
         value = str(value).lower() if isinstance(value, (bool, str)) else value
@@ -142,36 +140,27 @@ def check_value(parameter: Parameter, value: object) -> Value:
     return value if isinstance(value, int) else int(number)
 
 
-def _elements(parameter: Parameter, value: object) -> list[object]:
+def _checked_list(parameter: Parameter, value: object) -> tuple[float, ...] | tuple[str, ...]:
+    refused = partial(ParameterError, parameter.name)
     if isinstance(value, str):
         listed = value.strip('[] ')
         value = [element.strip() for element in listed.split(',')] if listed else []
     if isinstance(value, Mapping) or not isinstance(value, Iterable):
-        kind = 'names' if parameter.names else 'numbers'
-        raise ParameterError(parameter.name, value, f'must be a list of {kind}')
-    return list(value)
-
-
-def _names(parameter: Parameter, value: object) -> tuple[str, ...]:
-    names = _elements(parameter, value)
+        raise refused(value, f'must be a list of {"names" if parameter.names else "numbers"}')
+    elements = list(value)
+    if not parameter.names:
+        numbers = tuple(_number(parameter, element) for element in elements)
+        if len(numbers) != (parameter.length or len(numbers)):
+            raise refused(elements, f'must have {parameter.length} numbers')
+        if not numbers and parameter.default != ():
+            raise refused([], 'must have at least one number')
+        return numbers
     namespace = re.compile('[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*')  # as ROS takes it
-    for name in names:
-        if not isinstance(name, str) or not namespace.fullmatch(name) or names.count(name) > 1:
-            raise ParameterError(
-                parameter.name, names, 'must be a list of names',
-                'each once, of letters, digits and single _, a letter first; quote true, on, ...',
-            )
-    return tuple(map(str, names))
-
-
-def _numbers(parameter: Parameter, value: object) -> tuple[float, ...]:
-    elements = _elements(parameter, value)
-    numbers = tuple(_number(parameter, element) for element in elements)
-    if len(numbers) != (parameter.length or len(numbers)):
-        raise ParameterError(parameter.name, elements, f'must have {parameter.length} numbers')
-    if not numbers and parameter.default != ():
-        raise ParameterError(parameter.name, [], 'must have at least one number')
-    return numbers
+    for name in elements:
+        if not isinstance(name, str) or not namespace.fullmatch(name) or elements.count(name) > 1:
+            raise refused(elements, 'must be a list of names', 'each once, of letters, digits and '
+                          'single _, a letter first; quote true, on, ...')
+    return tuple(elements)
 
 
 def _number(parameter: Parameter, value: Any) -> float:
