@@ -31,7 +31,7 @@ class WatchPublisher:
     After v(k) comes the u that it led to, known with y(k+1): points of their loop.
     """
 
-    PERIOD_S = 0.04  # between two messages of a topic; a loop at 1 kHz has no time for many more
+    PAUSE_S = 0.04  # after a message of a topic; a loop at 1 kHz has no time for many more
 
     def __init__(self, node: Node, joint: str) -> None:
         self._publishers = {
@@ -52,8 +52,7 @@ class WatchPublisher:
     def follow(self, signals: Row, estimates: Row) -> None:
         """Publish what is due of a sample, given by its rows in the order of their labels."""
         now_s = time.monotonic()
-        # The comparison of times must not lose one message of each round to rounding.
-        due = now_s > self._due_s - 1e-9
+        due = now_s > self._due_s
         if not (self.heard and (due or self._u_waits)):
             return
         values = watched_values(signals, estimates)
@@ -62,8 +61,7 @@ class WatchPublisher:
                 self._publishers[label].publish(Float64(data=values[label]))
         self._u_waits = due
         if due:
-            # After a pause each is due once.
-            self._due_s = max(self._due_s, now_s - self.PERIOD_S) + self.PERIOD_S
+            self._due_s = now_s + self.PAUSE_S
 
 
 def watched_values(signals: Row, estimates: Row) -> dict[str, float]:

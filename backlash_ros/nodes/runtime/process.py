@@ -104,9 +104,13 @@ class ProcessNode(ParameterNode):
         """Say what there is to say at the end; called once, whatever ended the work."""
 
     def call_when(
-        self, condition: Callable[[], bool], action: Callable[[], None], awaited: str,
+        self, condition: Callable[[], bool], action: Callable[[], object], awaited: str,
+        starts: bool = False,
     ) -> None:
-        """Call action as soon as condition holds; `awaited` says in the log what is missing."""
+        """Call action as soon as condition holds. starts: the node is ready then.
+
+        awaited: what the log says is missing.
+        """
         remind = time.monotonic() + 5.0
 
         def look() -> None:
@@ -114,22 +118,14 @@ class ProcessNode(ParameterNode):
             if condition():
                 self.destroy_timer(timer)
                 action()
+                if starts:
+                    self.started = True
+                    emit('ready')
             elif time.monotonic() > remind:
                 remind += 5.0
                 self.log.info(f'waiting for {awaited}')
 
         timer = self.every(0.01, look)
-
-    def start_when(
-        self, condition: Callable[[], bool], start: Callable[[], object], awaited: str,
-    ) -> None:
-        """Call start as soon as condition holds, and tell that the node is ready."""
-        def ready() -> None:
-            start()
-            self.started = True
-            emit('ready')
-
-        self.call_when(condition, ready, awaited)
 
 
 def run(
