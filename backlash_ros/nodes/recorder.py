@@ -208,10 +208,10 @@ class RecorderNode(ProcessNode):
         received = {topic: channel.received for topic, channel in self._channels.items()}
         first = _row(topics.SIGNALS, self._first_signals).get('sample', nan)
         # A joint that was not answered has nan for everything.
-        sample = min(signals.get('sample', nan), estimates.get('sample', nan))
-        if isfinite(sample) and isfinite(first):
+        samples = [row.get('sample', nan) for row in (signals, estimates)]
+        if all(map(isfinite, (*samples, first))):
             emit(
-                'progress', sample=int(sample), received=received,
+                'progress', sample=int(min(samples)), received=received,
                 lost=int(signals['sample'] - first) + 1 - received[topics.SIGNALS],
                 **{name: estimates[name] for name in topics.BACKLASH},
                 **{f'true_{name}': truth.get(name) for name in topics.BACKLASH},
