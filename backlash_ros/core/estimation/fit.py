@@ -81,7 +81,7 @@ class Problem:
 
     @cached_property
     def _walk(self) -> Array:
-        """d by each of its knots, 8 samples apart or more, and to 0 at the end (W, N)."""
+        """d by each of its knots, 8 samples apart or more, and 0 at the end (W, N)."""
         count = len(self.v)
         knots = min(max(count // 8, 1), 36)
         place = np.arange(count) * knots / max(count - 1, 1)
@@ -94,12 +94,11 @@ class Problem:
         knots = f.knots if len(f.knots) == len(self._walk) else np.zeros(len(self._walk))
         return self._walk, knots, f.walk_std * sqrt(len(self.v) / len(self._walk))
 
-    def log_posterior(self, f: WindowFit, w: Array | None = None) -> float:
-        """Of these values; w: weights of the readings (N,), None for those of f. -inf for nan."""
+    def log_posterior(self, f: WindowFit, w: Array) -> float:
+        """Of these values, where readings have these weights (N,); -inf where it is no number."""
         leak, xi = f.theta[3:3 + self.family.leaks], f.theta[3 + self.family.leaks:]
         with np.errstate(all='ignore'):
             run = self.at(f)
-            w = run.weights if w is None else w
             squares = float(xi @ xi) / f.scale**2 + float(leak @ leak)
             squares += float(np.sum((self.older.rows @ f.theta - self.older.values) ** 2))
             value = -0.5 * (squares + log(f.scale) ** 2) - len(xi) * log(f.scale)
@@ -192,11 +191,6 @@ class Problem:
         beside.extend(np.column_stack([np.zeros((len(older.rows), at)), older.rows, older.values]))
         return np.hstack([of_samples, np.array(beside).T]).T
 
-    def normalised(self, f: WindowFit) -> Array:
-        """Residuals of deviation 1, or what stands for them with intervals (N,); 0 where lost."""
-        _, score, information = self.at(f).likelihood
-        return np.asarray(score * np.sqrt(self.at(f).weights / information))
-
     def jacobian(self, f: WindowFit) -> Array:
         """Derivatives of y by X, knots, p0, m, o, g, xi: (N, P)."""
         run, count = self.at(f), len(self.v)
@@ -213,8 +207,9 @@ class Problem:
 
     def fitted(self, f: WindowFit, steps: int = STEPS) -> WindowFit:
         """Gauss-Newton steps from f until they move nothing, halved where they go too far."""
-        least_move = 0.02  # deviations of the gap that a step may still move it by at the end
         far_steps = 4  # the first of them, over which G is no further off than configured
+        # Deviations of the gap that a step may still move it by at the end.
+        least_move = 0.02 if steps > FEW_STEPS else 0.2
         for k in range(steps):
             weights = self.at(f).weights
             best = self.log_posterior(f, weights)
@@ -223,7 +218,6 @@ class Problem:
             new, there, value = self._stepped(f, best, weights, most)
             if not value > best - 0.5:
                 # A kink where the play began bars the way to all else: held there, it does not.
-                # The posterior stays that of a step that holds nothing.
                 _, begun, of_begun = self._stepped(f, best, weights, most, begun=True)
                 if of_begun > value:
                     there = replace(begun, cov=new.cov, scale=new.scale, volume=new.volume)
@@ -237,7 +231,7 @@ class Problem:
                 continue
             moved = abs(there.gap - f.gap) / max(sqrt(max(new.cov[2, 2], 0.0)), 1e-300)
             f = there if there.step else replace(there, noise_std=self._noise_of(there))
-            if moved < least_move * (1 if steps > FEW_STEPS else 10) and value - best < 1.0:
+            if moved < least_move and value - best < 1.0:
                 break
         return f
 
@@ -262,7 +256,6 @@ class Problem:
         return new, there, value
 
     def _towards(self, f: WindowFit, new: WindowFit, share: float = 1.0) -> WindowFit:
-        """The values this share of the way from f to new, with the posterior of new."""
         longest = 2.0  # prior deviations by which G moves at once
         furthest = float(np.abs(new.theta[3:] - f.theta[3:]).max(initial=0.0))
         length = share * min(longest / max(furthest, longest), 1.0)
@@ -337,10 +330,7 @@ class Problem:
         return self.finished(self.fitted(f.without_intervals))
 
     def with_walk(self, f: WindowFit, least: float) -> WindowFit:
-        """The fit, or one where u walks as well if that explains why residuals are correlated.
-
-        least: walk that is configured, per square root of a sample.
-        """
+        """The fit, or one with a larger walk of u if that explains correlated residuals."""
         best, begin = f, replace(f.without_intervals, knots=np.zeros(0), walk_std=least)
         if f.walk_std != least:
             best = self.with_intervals(self.fitted(begin))

@@ -34,7 +34,7 @@ class Likelihood(NamedTuple):
 
 def step_of(y: Array) -> float:
     """The step of which all distances between readings (N,) are multiples; 0 for none."""
-    even = 1e-3  # share of a step by which distances of readings may be off a whole number of them
+    even = 1e-3  # share of a step by which distances may be off a whole number of them
     different = np.unique(y[np.isfinite(y)])
     if len(different) < 8:  # different ones that tell a step
         return 0.0
@@ -170,11 +170,9 @@ class WindowFit:
         return self.cov[3:, 3:] * self.inflation
 
     @property
-    def prior_of_xi(self) -> Prior | None:
+    def prior_of_xi(self) -> Prior:
         """What it knows of xi alone."""
         count = len(self.theta) - 3
-        if not count:
-            return None
         root = np.linalg.inv(np.linalg.cholesky(self.cov_xi + 1e-12 * np.eye(count)))
         return Prior(np.hstack([np.zeros((count, 3)), root]), root @ self.theta[3:])
 

@@ -28,7 +28,7 @@ from backlash_ros.core.estimation.belief import (
 )
 from backlash_ros.core.estimation.explanations import Setup, Window, afresh, mixed, outliers
 from backlash_ros.core.estimation.fit import FEW_STEPS, Problem
-from backlash_ros.core.estimation.posterior import WindowFit
+from backlash_ros.core.estimation.posterior import Prior, WindowFit
 from backlash_ros.core.estimation.score_tests import coasts, likelier
 from backlash_ros.core.estimation.settings import BLOCKS, FEWEST, MISFIT, PREDICTED, SHORT_RECORD
 
@@ -65,8 +65,7 @@ def _searching(setup: Setup, record: Window, before: Belief) -> Belief:
             and not setup.is_known(tried, record.turns(max(tried.gap, 0.0), tried.p0)):
         return before._replace(end=record.end, next_at=soon)
     # What many reversals do not tell, a few more will not.
-    lasting = tried is not None and tried.left.turns >= settings.HELD_REVERSALS
-    growth = 2.0 if lasting else settings.GROWTH
+    growth = 2.0 if tried and tried.left.turns >= settings.HELD_REVERSALS else settings.GROWTH
     search_at = record.end + max(int(count * (growth - 1.0)), FEWEST)
     found = afresh(setup, record, also=tried, walks=True)
     part = shorter = record
@@ -79,16 +78,14 @@ def _searching(setup: Setup, record: Window, before: Belief) -> Belief:
             found, part = newest, shorter
             break
     after = before._replace(end=record.end, next_at=search_at, thorough=Look(search_at),
-                    found=None, reason=why, coasts=False)
+                            found=None, reason=why, coasts=False)
     if found is None:
         return after
     part, found, swapped = _with_commands(setup, part, found, before.kept.swapped)
     known = before.published and before.published.crossings
-    runs_on = coasts(setup.problem(part), found, known)
-    after = after._replace(
-        kept=before.kept._replace(swapped=swapped), found=found, coasts=runs_on,
-        reason=Status.INCONSISTENT if runs_on else why,
-    )
+    if coasts(setup.problem(part), found, known):
+        after = after._replace(coasts=True, reason=Status.INCONSISTENT)
+    after = after._replace(kept=before.kept._replace(swapped=swapped), found=found)
     if not setup.is_known(found):
         # But for a reversal, which may come soon?
         return after._replace(next_at=soon) if setup.is_known(found, settings.REVERSALS) else after
@@ -96,19 +93,15 @@ def _searching(setup: Setup, record: Window, before: Belief) -> Belief:
         # A first estimate has to be found twice: some samples alone may mislead.
         return after._replace(next_at=soon)
     # What leaves more than noise must predict a quarter as many samples before it is believed.
-    more = found.systematic or setup.noisier(found)
-    trial = before.trial._replace(must=max(before.trial.must, len(part.v) // 4 if more else 0))
-    kept = after.kept._replace(older=None)
-    return _adopted(setup, part, found, after._replace(kept=kept, trial=trial))
+    more = len(part.v) // 4 if found.systematic or setup.noisier(found) else 0
+    trial = before.trial._replace(must=max(before.trial.must, more))
+    return _adopted(setup, part, found, None, after._replace(trial=trial))
 
 
 def _with_commands(
     setup: Setup, record: Window, found: WindowFit, swapped: frozenset[int],
 ) -> tuple[Window, WindowFit, frozenset[int]]:
-    """The record, the fit and the commands that go with each other, found in turn.
-
-    Commands that leave more than noise explain nothing: those that were sent stay.
-    """
+    """The record, the fit and the commands that go with each other, found in turn."""
     sent = record, found, swapped
     for _ in range(4 if np.isfinite(record.other).any() else 0):
         before = swapped
@@ -116,6 +109,7 @@ def _with_commands(
         if swapped == before:
             break
         found = afresh(setup, record, also=found) or found
+    # Commands that leave more than noise explain nothing: those that were sent stay.
     return sent if found.systematic and setup.noisier(found) else (record, found, swapped)
 
 
@@ -135,16 +129,18 @@ def _why(setup: Setup, found: WindowFit | None, record: Window, before: Belief) 
     return Status.INCONSISTENT if wrong or (known and setup.is_known(found)) else Status.ACQUIRING
 
 
-def _adopted(setup: Setup, record: Window, fit: WindowFit, before: Belief) -> Belief:
-    """The fit of this record is what is believed."""
-    count, must, kept = len(record.v), before.trial.must, before.kept
+def _adopted(
+    setup: Setup, record: Window, fit: WindowFit, older: Prior | None, before: Belief,
+) -> Belief:
+    """The fit of this record, beside what older samples say, is what is believed."""
+    count, must = len(record.v), before.trial.must
     another_noise = before.published is None or fit.walk_std > 0.0
     if before.fit is not None and another_noise and fit.alike(before.fit):
         must = min(must, PREDICTED)  # another noise, or a walk, but not another backlash
     return published(setup, before._replace(
-        found=None, doubt_from=None, end=record.end,
-        coasts=coasts(setup.problem(record, kept.older), fit),
-        kept=kept._replace(first=record.first), trial=Trial(must, 0, fit.noise),
+        found=None, doubt_from=None, coasts=coasts(setup.problem(record, older), fit),
+        kept=before.kept._replace(first=record.first, older=older),
+        trial=Trial(must, 0, fit.noise),
         next_at=record.end + max(count // BLOCKS, FEWEST),
         thorough=Look(record.end + count // 4, 0.5 * fit.gap_std),
     ), fit)
@@ -184,9 +180,8 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
             reason=Status.INCONSISTENT if lately else before.reason,
         )
     after = before._replace(
-        end=record.end, next_at=record.end + max(count // BLOCKS, FEWEST),
-        kept=kept, trial=trial._replace(predicted=trial.predicted + count - new),
-    )
+        end=record.end, next_at=record.end + max(count // BLOCKS, FEWEST), kept=kept,
+        trial=trial._replace(predicted=trial.predicted + count - new))
     narrow = fit.gap_std < before.thorough.gap_std and count <= SHORT_RECORD
     if narrow or record.end >= before.thorough.at:
         fit, other = problem.with_intervals(fit), None
@@ -197,8 +192,7 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
             known = other is not None and setup.is_known(other, settings.REVERSALS)
             fit = mixed(problem, fit, [other] if other is not None and known else [])
         fit = problem.with_walk(fit, setup.walk_std)
-        after = after._replace(
-            thorough=Look(record.end + 2 * count // 5, 0.5 * fit.gap_std))
+        after = after._replace(thorough=Look(record.end + 2 * count // 5, 0.5 * fit.gap_std))
     else:
         fit = problem.finished(fit)
     after = after._replace(coasts=coasts(problem, fit))
@@ -208,10 +202,8 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
 def _contradicts(
     problem: Problem, held: WindowFit, fit: WindowFit, new: int, rho: float,
 ) -> bool:
-    """Whether the samples from `new` on contradict what was held, and `fit` that takes them in.
-
-    They do as well where it takes them in at the cost of all others. rho: correlation of residuals.
-    """
+    """Whether samples from `new` on contradict what was held, or `fit` takes them in at the cost of
+    all others; rho: correlation of residuals."""
     weights = problem.at(fit).weights
     z = problem.residual(fit) / held.noise
     if float(np.nanmean(z**2)) > _most(settings.AS_GOOD**2, float(weights.sum()), rho):
@@ -226,7 +218,7 @@ def _contradicts(
 
 
 def _most(least: float, count: float, rho: float) -> float:
-    """Mean square of so many normalized residuals that is no chance: correlated ones are fewer."""
+    """Mean square of so many normalized residuals of correlation rho that is no chance."""
     from scipy.special import chdtri  # where fits are made: 31 MB
 
     free = max(count / (1.0 + (count - 1.0) * rho), 1.0)
@@ -239,8 +231,8 @@ def _doubted(setup: Setup, record: Window, before: Belief) -> Belief:
     assert held is not None
     assert since is not None
     count, newer = len(record.v), record.end - since
-    after = before._replace(end=record.end, found=None,
-                    next_at=record.end + max(newer // 4, FEWEST))
+    after = before._replace(
+        end=record.end, found=None, next_at=record.end + max(newer // 4, FEWEST))
     z = setup.problem(record, kept.older).residual(held) / held.noise
     if newer >= 2 * PREDICTED and np.nanmean(z[-PREDICTED:] ** 2) < MISFIT:
         # Whatever it was, it is over: what was measured meanwhile says nothing.
@@ -252,8 +244,7 @@ def _doubted(setup: Setup, record: Window, before: Belief) -> Belief:
     if newer >= PREDICTED:
         after = after._replace(reason=Status.INCONSISTENT)
     short = max(SHORT_RECORD, 4 * setup.family.memory)
-    explained = settings.AS_GOOD * held.noise
-    whole = None
+    explained, whole = settings.AS_GOOD * held.noise, None
     if count <= max(short, 4 * newer) and count < settings.LONGEST:
         whole = afresh(setup, record, walks=newer >= 2 * PREDICTED)
         if whole is not None and not whole.left.rms < explained:
@@ -269,11 +260,9 @@ def _doubted(setup: Setup, record: Window, before: Belief) -> Belief:
             break
         if before.found is None or not before.found.alike(found):
             return after._replace(found=found)
-        return _adopted(setup, part, found, after._replace(kept=kept._replace(
-            first=0, older=held.prior_of_xi)))
+        return _adopted(setup, part, found, held.prior_of_xi, after)
     if whole is not None and setup.is_known(whole):
-        return _adopted(setup, record, whole, after._replace(
-            kept=kept._replace(older=None)))
+        return _adopted(setup, record, whole, None, after)
     # Two reversals of the record take so long, on average.
     if newer > max(short, 2 * count // max(held.left.turns, 1)):
         return _begun_anew(after, since, record.end, record.end + 1)

@@ -228,7 +228,9 @@ def _convolved(a: Array, b: Array) -> Array:
 def covariance_of(problem: Problem, f: WindowFit) -> Array:
     """Covariance of theta, shape (3 + K, 3 + K)."""
     columns, count = problem.rows(f)[:, :-1], len(problem.v)
-    residual = np.where(problem.known, problem.normalised(f), np.nan)
+    run = problem.at(f)
+    _, score, information = run.likelihood
+    residual = np.where(problem.known, score * np.sqrt(run.weights / information), np.nan)
     columns[:count][~problem.known] = 0.0
     size = np.sqrt(np.einsum('ij,ij->j', columns, columns))
     size[size == 0.0] = np.inf  # what no sample depends on
