@@ -32,16 +32,12 @@ class Known(NamedTuple):
 
 
 class Kept(NamedTuple):
-    """What is kept of the samples: those from number `first` on, and what the older ones say.
-
-    rejected: numbers of readings that are outliers. swapped: numbers of the samples over which the
-    other command acted.
-    """
+    """What is kept of the samples: those from number `first` on, and what the older ones say."""
 
     first: int = 0
     older: Prior | None = None
-    rejected: frozenset[int] = frozenset()
-    swapped: frozenset[int] = frozenset()
+    rejected: frozenset[int] = frozenset()  # numbers of readings that are outliers
+    swapped: frozenset[int] = frozenset()  # of samples over which the other command acted
 
 
 class Look(NamedTuple):
@@ -60,25 +56,20 @@ class Trial(NamedTuple):
 
 
 class Belief(NamedTuple):
-    """What is believed after the samples before `end`; inherited: what was known before the run.
-
-    found: newest fit that is not adopted. doubt_from: sample from which on the fit is contradicted.
-    next_at: number of samples at which to look again, thorough: for other gaps too. coasts: whether
-    the load runs on within the gap. reason: of what is published.
-    """
+    """What is believed after the samples before `end`."""
 
     fit: WindowFit | None = None
-    found: WindowFit | None = None
-    doubt_from: int | None = None
+    found: WindowFit | None = None  # the newest that is not adopted
+    doubt_from: int | None = None  # sample from which on the fit is contradicted
     end: int = 0
-    next_at: int = settings.FIRST_FIT
-    thorough: Look = Look()
+    next_at: int = settings.FIRST_FIT  # number of samples at which to look again
+    thorough: Look = Look()  # for other gaps too
     kept: Kept = Kept()
     trial: Trial = Trial()
     published: Known | None = None
-    inherited: Known | None = None
-    reason: Status = Status.ACQUIRING
-    coasts: bool = False
+    inherited: Known | None = None  # before the run
+    reason: Status = Status.ACQUIRING  # of what is published
+    coasts: bool = False  # whether the load runs on within the gap
 
     @property
     def state(self) -> State:
@@ -111,8 +102,7 @@ def published(setup: Setup, belief: Belief, fit: WindowFit) -> Belief:
 def _beside_inherited(setup: Setup, belief: Belief, fit: WindowFit, known: Known) -> Belief:
     """The same where something was known before the run.
 
-    What the samples leave unexplained may be gap as well, and the lost motion of a gear differs
-    from one motion to another.
+    What samples leave unexplained may be gap as well, and a gear's lost motion differs by motion.
     """
     replacing = 0.05  # std of the gap over the gap, from which samples alone replace what was known
     doubt = (fit.unexplained * fit.gap) ** 2 / 2.0
@@ -145,10 +135,7 @@ def _beside_inherited(setup: Setup, belief: Belief, fit: WindowFit, known: Known
 def shortened(
     setup: Setup, record: Window, problem: Problem, belief: Belief, fit: WindowFit,
 ) -> tuple[Belief, WindowFit]:
-    """Let the oldest samples go where the others hold enough reversals, or the backlash drifts.
-
-    What they say of theta stays, discounted as they were.
-    """
+    """Let the oldest samples go, but for what they say of theta, once the others hold enough."""
     count, kept, p = len(record.v), belief.kept, problem.at(fit).p
     turns, drift = reversals(engaged(record.v, p, fit.gap)), setup.drift**2 * count / 3.0
     cut = 0

@@ -39,8 +39,7 @@ def fitted(
 ) -> Fitted:
     """What is believed with these samples: the job that is done beside the loop.
 
-    model: the G whose state the structure wants. proposed: xi (K,) of the newest proposal, () where
-    G is not to be learned.
+    model: whose state the structure wants. proposed: xi of the newest G (K,), () if to be left.
     """
     swapped = before.kept.swapped
     record = Window(samples.first, *samples.columns).swapped(swapped)
@@ -123,8 +122,7 @@ class MovingHorizon(Law):
     def report(self) -> LawReport:
         belief, found, setup = self._belief, self._belief.found, self._setup
         fit = belief.fit or found
-        precise = found is not None and setup.is_precise(found)
-        outside = setup.outside_bounds(found) if found is not None and precise else []
+        outside = setup.outside_bounds(found) if found and setup.is_precise(found) else []
         return LawReport(
             noise_ratio=nan if belief.fit is None else belief.fit.noise / setup.noise_std,
             unexplained=nan if fit is None else fit.unexplained,
@@ -190,9 +188,8 @@ class MovingHorizon(Law):
         if channel.busy:
             self._take(channel.poll())
         due = channel.record.end >= self._belief.next_at or following.surprised
-        if channel.busy or not due or not self.adapting or (
-            following.observer is not None and following.since_motion > setup.family.memory
-        ):
+        resting = following.observer and following.since_motion > setup.family.memory
+        if channel.busy or not due or not self.adapting or resting:
             return
         following.beyond += following.surprised  # once
         channel.submit(
@@ -203,10 +200,8 @@ class MovingHorizon(Law):
 
     def _take(self, result: Fitted | Failure | None) -> None:
         """Go on from what is believed after the newest fit."""
-        if result is None:
-            return
-        if self._skipping_fit:
-            self._skipping_fit = False
+        if result is None or self._skipping_fit:
+            self._skipping_fit = self._skipping_fit and result is None
             return
         if isinstance(result, Failure):
             self._failed_fits += 1
@@ -215,9 +210,8 @@ class MovingHorizon(Law):
         before, belief, following = self._belief, result.belief, self._following
         self._belief, place, fit = belief, result.place, belief.fit
         self._reattributed += len(belief.kept.swapped - before.kept.swapped)
-        if belief.published is not None and (
-            belief.published is not before.published or belief.coasts is not before.coasts
-        ):
+        news = belief.published is not before.published or belief.coasts is not before.coasts
+        if belief.published is not None and news:
             self.estimate = self._estimate_of(belief, belief.published)
         if place is None or fit is None:
             return

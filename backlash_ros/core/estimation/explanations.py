@@ -24,19 +24,15 @@ from backlash_ros.core.plant.transfer_function import Array
 
 @dataclass(frozen=True)
 class Setup:
-    """What is known before the first sample, and what counts as known after some.
-
-    noise_std: of y, nominal. widest: gap that is considered. guess: gap of the first guess.
-    walk_std: of u, drift: of m, c_r, c_l (3,), both per square root of a sample.
-    """
+    """What is known before the first sample, and what counts as known after some."""
 
     family: PlantFamily
-    noise_std: float
+    noise_std: float  # of y, nominal
     bounds: Bounds
-    widest: float
-    guess: float
-    walk_std: float
-    drift: Array
+    widest: float  # gap that is considered
+    guess: float  # gap of the first guess
+    walk_std: float  # of u per square root of a sample
+    drift: Array  # of m, c_r, c_l, as well (3,)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'noise_std', max(self.noise_std, 1e-12))
@@ -45,14 +41,11 @@ class Setup:
         return Problem(self.family, record.v, record.y, self.noise_std, older)
 
     def is_known(self, f: WindowFit, turns: int | None = None) -> bool:
-        """Whether m and the gap are known well enough to be published, and within their bounds.
-
-        turns: reversals of the engaged side that speak for it, None for those of its record.
-        """
+        """Whether m and the gap are known well enough to be published, and within their bounds."""
         return self.is_precise(f, turns) and not self.outside_bounds(f)
 
     def is_precise(self, f: WindowFit, turns: int | None = None) -> bool:
-        """The same, whatever the bounds are."""
+        """The same, whatever the bounds are; turns: reversals, None for those of its record."""
         enough = (f.left.turns if turns is None else turns) >= self.turns_needed
         return f.valid and enough and not self.moves_unexplained(f) and \
             self.are_precise(f.crossings, f.crossings_cov, f.systematic)
@@ -62,11 +55,8 @@ class Setup:
         return settings.REVERSALS if self.family.count else 1
 
     def are_precise(self, crossings: Array, cov: Array, systematic: bool) -> bool:
-        """Whether m, c_r, c_l (3,) of this covariance (3, 3) are known well enough.
-
-        systematic: whether residuals are correlated: what causes that does not average out. A gap
-        is also known where its upper end is small beside the first guess: there is none.
-        """
+        """Whether m, c_r, c_l (3,) of this covariance (3, 3) are known well enough."""
+        # What makes residuals systematic does not average out.
         factor = 1.0 / settings.BY_CHANCE if systematic else 1.0
         m, c_r, c_l = map(float, crossings)
         std_m, *std = map(float, np.sqrt(np.maximum(np.diag(cov), 0.0)))
@@ -132,7 +122,7 @@ class Window(NamedTuple):
         return self._replace(y=y)
 
     def turns(self, gap: float, p0: float) -> int:
-        """Reversals of the engaged side, for this gap."""
+        """Reversals of the engaged side."""
         return len(reversals(engaged(self.v, play(self.v, gap, p0), gap)))
 
 
@@ -142,8 +132,8 @@ def afresh(
 ) -> WindowFit | None:
     """The best fit from nothing, mixed with other gaps that fit about as well; None for none.
 
-    like: G is about that of this fit. older: what is known beside the record. also: where to begin
-    as well. walks: whether u may walk. A fit with m < 0 says that y goes the other way.
+    like: G is about that of this fit. also: where to begin as well. walks: whether u may walk. A
+    fit with m < 0 says that y goes the other way.
     """
     family, swing, first = setup.family, float(np.ptp(record.v)), float(record.v[0])
     if np.isfinite(record.y).sum() < 15 + 2 * family.count or not swing:
@@ -191,10 +181,7 @@ def afresh(
 
 
 def mixed(p: Problem, best: WindowFit, others: Sequence[WindowFit] = ()) -> WindowFit:
-    """The likeliest of these fits, with what its covariance of m, c_r, c_l lacks.
-
-    That is the mixture with the other ones, and with those that the way along the gap leads to.
-    """
+    """The likeliest of these fits, and of those along the gap, with the spread of the mixture."""
     wider, beyond = _along_the_gap(p, best)
     fits = [f for f in (best, *others, *beyond) if f.valid]
     alike_read = [f for f in fits if bool(f.step) == bool(best.step)]
@@ -215,9 +202,8 @@ def _apart(one: WindowFit, other: WindowFit) -> Array:
 def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]:
     """What readings leave open along the gap, all else fitted (3, 3), and fits that it leads to.
 
-    r deviations from the best they should be less likely by r^2 / 2, or it is as far as it takes
-    until they are less likely at all. Where they are less likely by half of that only, another fit
-    may lie beyond, with other samples at which a side is engaged.
+    r deviations from the best they should be less likely by r^2 / 2. Where they are less likely by
+    half of that only, another fit may lie beyond, with other samples at which a side is engaged.
     """
     out, beyond = np.zeros((3, 3)), list[WindowFit]()
     if not best.valid or not best.gap > 0.0 or not best.cov[2, 2] > 0.0:

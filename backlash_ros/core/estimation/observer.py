@@ -32,16 +32,12 @@ RATIOS = tuple(10.0**exponent for exponent in range(-4, 5))
 
 
 class Gain(NamedTuple):
-    """gain: after a prediction, in the observer form. innovation: its deviation over that of y.
+    """Of the stationary Kalman filter, in units of the noise of y."""
 
-    cov: of the state in the coordinates of StateModel, in units of the variance of y, (n, n).
-    quiet: what `innovation` is with this gain where the noise on u is that of the next smaller one.
-    """
-
-    gain: tuple[float, ...]
-    innovation: float
-    cov: Array
-    quiet: float
+    gain: tuple[float, ...]  # after a prediction, in the observer form
+    innovation: float  # its deviation
+    cov: Array  # of the state in the coordinates of StateModel, (n, n)
+    quiet: float  # `innovation` with this gain, but with the next smaller noise on u
 
 
 @lru_cache(maxsize=64)
@@ -68,7 +64,7 @@ def gain_of(model: StateModel, ratio: float) -> Gain:
 
 
 class Observer:
-    """Follows the state of G, kept in the observer form. noise_std: of y.
+    """Follows the state of G, kept in the observer form.
 
     before: that of another G for the same plant: innovations are no larger with this one. variance:
     of the innovation, measured. cov: of the state in the coordinates of StateModel, (n, n).
@@ -121,10 +117,7 @@ class Observer:
 
 
 class Place(NamedTuple):
-    """Where the samples of a fit leave play and G.
-
-    p: of the play operator. u, y: over the newest samples (M,). x: state of `model`, observer form.
-    """
+    """Where samples leave p and x of `model` (observer form); u, y: over the newest ones (M,)."""
 
     p: float
     u: Array
@@ -223,8 +216,9 @@ class Following:
         better than the newest samples do.
         """
         own, other = self.model.transfer_function, place.model
-        follows = np.array_equal(other.denominator, own.denominator) \
-            and np.array_equal(other.numerator, own.numerator)
+        if not (np.array_equal(other.denominator, own.denominator)
+                and np.array_equal(other.numerator, own.numerator)):
+            return  # another G was adopted meanwhile
         if self.observer is None:
             self.observer = Observer(self.model, noise_std)
         else:
@@ -232,11 +226,9 @@ class Following:
         observer = self.observer
         self._u, self._y = deque(place.u.tolist(), ROWS), deque(place.y.tolist(), ROWS)
         self._p, self.u = place.p, estimate.m * (place.p - estimate.c_r)
-        if follows:
-            observer.place(place.x, known)
+        observer.place(place.x, known)
         for v, y in newer.T.tolist():
             self._advance(v, y, estimate)
-            if follows:
-                innovation = y - observer.predict(self.u)
-                if innovation * innovation <= GATE**2 * observer.variance:  # not where y was lost
-                    observer.correct(innovation)
+            innovation = y - observer.predict(self.u)
+            if innovation * innovation <= GATE**2 * observer.variance:  # not where y was lost
+                observer.correct(innovation)

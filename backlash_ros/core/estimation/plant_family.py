@@ -24,31 +24,27 @@ from backlash_ros.core.plant.transfer_function import ON_CIRCLE, Array, Transfer
 
 
 class Family(Protocol):
-    """Plants b / a that a fit chooses from, by K = count unknowns xi.
-
-    leaks: how many of the first xi have a prior of deviation 1 each; the others share a scale.
-    """
+    """Plants b / a that a fit chooses from, by K = count unknowns xi."""
 
     @property
     def count(self) -> int: ...
 
     @property
-    def leaks(self) -> int: ...
+    def leaks(self) -> int:
+        """How many of the first xi have a prior of deviation 1 each; the others share a scale."""
 
     def at(self, xi: list[float]) -> tuple[list[float], list[float]]:
-        """b and a of y(k) = sum b_i u(k-i) - sum a_i y(k-i), of one length; u(k) acts before y(k).
-        """
+        """b, a of y(k) = sum b_i u(k-i) - sum a_i y(k-i), of one length; u(k) acts before y(k)."""
 
     def slopes(self, xi: list[float]) -> tuple[Array, Array]:
         """Derivatives of b and a by each xi, both of shape (K, n + 1)."""
 
 
 class PlantFamily:
-    """G(z; xi) around a nominal G.
+    """G(z; xi) around a nominal G, the model.
 
-    model: the nominal G. uncertainty: relative prior deviation of its frequencies, damping ratios
-    and delay; 0 where G is exact, K = 0. integrates: whether it has a pole at 1. memory: samples
-    after which the slowest stable mode has died out, within reason.
+    uncertainty: relative prior deviation of its frequencies, damping ratios and delay; 0 where G is
+    exact, K = 0. memory: samples after which the slowest stable mode has died out, within reason.
     """
 
     def __init__(self, model: TransferFunction, uncertainty: float) -> None:
@@ -154,11 +150,9 @@ def state_columns(a: list[float], count: int) -> Array:
 
 
 def sensitivities(family: Family, xi: list[float], u: Array, y: Array) -> Array:
-    """Derivatives of the output by each xi, (..., K, N); u, y: over A, input and output (..., N).
-    """
+    """Derivatives of y by each xi, (..., K, N); u, y: input and output over A, (..., N)."""
     of_b, of_a = family.slopes(xi)
-    length = of_b.shape[1]
-    return np.asarray(of_b @ delayed(u, length) - of_a @ delayed(y, length))
+    return np.asarray(of_b @ delayed(u, of_b.shape[1]) - of_a @ delayed(y, of_a.shape[1]))
 
 
 def _sections(poles: NDArray[np.complex128]) -> tuple[int, list[float]]:

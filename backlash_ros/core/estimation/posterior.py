@@ -82,9 +82,8 @@ def independence(
     y: Array, known: NDArray[np.bool_], output: Array, step: float,
 ) -> tuple[Array, NDArray[np.intp]]:
     """Share (N,) of an independent reading that each one is, and where these begin among the known.
-
-    Equal readings, one after the other, repeat one rounding while the output (N,) stands still.
     """
+    # Equal readings, one after the other, repeat one rounding while the output stands still.
     same_place = 16  # parts of a step within which an output counts as standing still
     weights = known.astype(np.float64)
     where = np.flatnonzero(known)
@@ -121,25 +120,19 @@ class Left(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class WindowFit:
-    """Values of all unknowns with their posterior.
+    """Values of all unknowns with their posterior."""
 
-    x: state before the record. knots: of the walk (W,), and walk_std, 0 for none. p0: p before the
-    record. theta: m, o, g, xi. noise_std: beside a step. step: of the readings where they are
-    taken for intervals, else 0. scale: s, the likeliest. cov: of theta, as if residuals were white.
-    volume: log of that of the posterior. spread: of m, c_r, c_l, by other gaps that fit alike.
-    """
-
-    x: Array
-    p0: float
-    theta: Array
-    noise_std: float
-    knots: Array = field(default_factory=lambda: np.zeros(0))
-    walk_std: float = 0.0
-    step: float = 0.0
-    scale: float = 1.0
-    cov: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    volume: float = 0.0
-    spread: Array = field(default_factory=lambda: np.zeros((3, 3)))
+    x: Array  # state before the record
+    p0: float  # p before the record
+    theta: Array  # m, o, g, xi (3 + K,)
+    noise_std: float  # beside a step
+    knots: Array = field(default_factory=lambda: np.zeros(0))  # of the walk of u (W,)
+    walk_std: float = 0.0  # per square root of a sample, 0 for none
+    step: float = 0.0  # of the readings where they are taken for intervals, else 0
+    scale: float = 1.0  # s, the likeliest
+    cov: Array = field(default_factory=lambda: np.zeros((0, 0)))  # as if residuals were white
+    volume: float = 0.0  # log of that of the posterior
+    spread: Array = field(default_factory=lambda: np.zeros((3, 3)))  # of m, c_r, c_l, by other gaps
     left: Left = field(default_factory=Left)
 
     @property
