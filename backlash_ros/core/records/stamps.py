@@ -135,13 +135,13 @@ def spread_evenly(t: Array, said: list[str], *signals: Array) -> Array:
     steps, counts = np.diff(starts)[1:], lengths[1:-1]
     whole = steps < 1.5 * np.median(steps)
     missing = np.round(steps * counts[whole].sum() / steps[whole].sum()) - counts
-    for paused in (np.zeros(len(steps)), np.where(missing > 1.0, missing, 0.0)):
-        number = place + np.repeat(np.cumsum([0.0, 0.0, *paused]), lengths)
-        period, begin = np.polyfit(number[begins[1:]], starts[1:], 1).tolist()
-        off = starts[1:] - period * number[begins[1:]]
-        if np.ptp(off) <= 1.5 * period:  # no single row is missing
-            period = fewest_digits(period, 2.0 * float(np.std(off)) / float(number[-1]))
-            return np.asarray(begin + period * number)
+    paused = np.where(missing > 1.0, missing, 0.0)
+    number = place + np.repeat(np.cumsum([0.0, 0.0, *paused]), lengths)
+    period, begin = np.polyfit(number[begins[1:]], starts[1:], 1).tolist()
+    off = starts[1:] - period * number[begins[1:]]
+    if np.ptp(off) <= 1.5 * period:  # no single row is missing
+        period = fewest_digits(period, 2.0 * float(np.std(off)) / float(number[-1]))
+        return np.asarray(begin + period * number)
     period = float(np.median(steps / counts))
     starts[0] = starts[1] - period * lengths[0]
     lasting = np.minimum(period, np.diff(starts, append=np.inf) / lengths)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -90,9 +91,12 @@ def read_run_or_log(
                 raise
             no_run = error
     parameters = None if config is None else effective_parameters(config, axis=axis)
-    period = None if parameters is None else parameters.sample_period
+    period, record = None if parameters is None else parameters.sample_period, None
+    with suppress(InputError):  # as `identify` takes it, if that fits
+        record = read_record(path, None, span, axis, columns)
     try:
-        record = _of_period(path, period, span, axis, columns)
+        if record is None or (period and abs(record.sample_period / period - 1.0) >= 0.01):
+            record = read_record(path, period, span, axis, columns)
     except InputError as error:
         raise no_run or error from None
     known = np.flatnonzero(np.isfinite(record.y))
@@ -110,17 +114,3 @@ def read_run_or_log(
 def _is_samples(path: Path) -> bool:
     with path.open('rb') as file:
         return file.readline().decode(errors='replace').startswith(','.join(SAMPLE_COLUMNS[:10]))
-
-
-def _of_period(
-    path: Path, period: float | None, span: Span, axis: str, columns: Mapping[str, str],
-) -> Record:
-    """The record as `identify` takes it, or else with the period [s] of the parameters."""
-    try:
-        record = read_record(path, None, span, axis, columns)
-        if period is None or abs(record.sample_period / period - 1.0) < 0.01:
-            return record
-    except InputError:
-        if period is None:
-            raise
-    return read_record(path, period, span, axis, columns)
