@@ -201,9 +201,9 @@ class RecorderNode(ProcessNode):
 
     def _tell(self) -> None:
         """Say how the run is going, of its first joint if it has several."""
-        signals, estimates, truth = (
+        signals, estimates = (
             _row(topic, self._channels[topic].newest)
-            for topic in (topics.SIGNALS, topics.ESTIMATES, topics.TRUTH)
+            for topic in (topics.SIGNALS, topics.ESTIMATES)
         )
         received = {topic: channel.received for topic, channel in self._channels.items()}
         first = _row(topics.SIGNALS, self._first_signals).get('sample', nan)
@@ -214,7 +214,6 @@ class RecorderNode(ProcessNode):
                 'progress', sample=int(min(samples)), received=received,
                 lost=int(signals['sample'] - first) + 1 - received[topics.SIGNALS],
                 **{name: estimates[name] for name in topics.BACKLASH},
-                **{f'true_{name}': truth.get(name) for name in topics.BACKLASH},
             )
 
 
