@@ -37,25 +37,22 @@ class Span(NamedTuple):
 WHOLE_SPAN = Span()
 # What several tools offer, by the name of the option.
 OPTIONS: dict[str, dict[str, Any]] = {
-    '--config': {'type': Path, 'metavar': 'FILE', 'help': 'ROS 2 parameter file, or the name of a '
-                 "shipped one (default: what stands beside a recorded run, else the paper's "
-                 'example)'},
+    '--config': {'type': Path, 'metavar': 'FILE', 'help': 'parameter file, or the name of a '
+                 "shipped one (default: that beside a recorded run, or the paper's example)"},
     '--set': {'action': 'append', 'default': [], 'metavar': '[AXIS/]KEY=VALUE', 'dest': 'settings',
               'help': 'change one parameter, of all axes or of one; may be given again'},
     '--sweep': {'action': 'append', 'default': [], 'metavar': 'KEY=v1,v2,...', 'help': 'run every '
                 'value of a parameter; given again, every combination'},
     '--columns': {'type': parse_columns, 'default': {}, 'metavar': 't=…,v=…,y=…', 'help': 'which '
-                  'columns of a table, or signals of a bag, these are (default: told by their '
-                  'names)'},
-    '--axis': {'default': '', 'metavar': 'NAME', 'help': 'of several axes or joints: the one that '
-               'is meant'},
+                  'columns of a table, or signals of a bag (default: told by their names)'},
+    '--axis': {'default': '', 'metavar': 'NAME', 'help': 'which one of several axes or joints'},
     '--seed': {'type': int, 'metavar': 'N', 'help': 'seed of the simulated noise'},
     '--duration': {'type': float, 'metavar': 'SECONDS', 'help': 'length of a run (default: the '
                    'parameter samples, or 10 s)'},
-    '--from': {'type': float, 'default': 0.0, 'metavar': 'S', 'dest': 'from_s',
-               'help': 'leave out what was before this time [s]'},
-    '--to': {'type': float, 'default': inf, 'metavar': 'S', 'dest': 'to_s',
-             'help': 'leave out what was from this time [s] on'},
+    '--from': {'type': float, 'default': 0.0, 'metavar': 'S', 'dest': 'from_s', 'help': 'leave '
+               'out what was before this time [s]'},
+    '--to': {'type': float, 'default': inf, 'metavar': 'S', 'dest': 'to_s', 'help': 'leave out '
+             'what was from this time on [s]'},
     '--out': {'type': Path, 'metavar': 'DIR', 'help': 'folder of the results (default: results/'
               '<UTC time>, and results/latest points at it)'},
 }
@@ -84,8 +81,8 @@ def number_of_samples(parameters: Parameters, duration: float | None) -> int:
     samples = round(duration / period)
     # It may miss a whole number by rounding alone.
     if samples < 1 or abs(duration / period - samples) > 1e-6 * samples:
-        raise InputError(
-            f'--duration={duration!r} must be a whole multiple of sample_period={period!r}')
+        raise InputError(f'--duration={duration!r} must be a whole multiple of '
+                         f'sample_period={period!r}')
     return samples
 
 

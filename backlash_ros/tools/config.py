@@ -66,11 +66,8 @@ class Configuration:
     def parameters(self, axis: str = '') -> Parameters:
         """Of a loop, maybe that of a joint: defaults, the file, --set, --seed."""
         if self.joints and axis not in self.joints:
-            raise InputError(
-                f'{self.path}: holds the joints {", ".join(self.joints)} of one controller: choose '
-                f'one of them, like --axis {self.joints[0]}, or start `controller` with the file '
-                'itself'
-            )
+            raise InputError(f'{self.path}: holds the joints {", ".join(self.joints)} of one '
+                             f'controller: choose one of them, like --axis {self.joints[0]}')
         return self.of_controller('' if self.joints else axis).of_joint(axis)
 
     def of_controller(self, axis: str = '') -> Parameters:
@@ -87,10 +84,8 @@ class Configuration:
     def given(self, axis: str = '') -> dict[str, Value]:
         """Values of the file for an axis, by flat name; raises InputError for none of them."""
         if self.axes and not axis:
-            raise InputError(
-                f'{self.path}: holds the axes {", ".join(self.axes)} and only one can be used '
-                f'here: choose it, like --axis {self.axes[0]}'
-            )
+            raise InputError(f'{self.path}: holds the axes {", ".join(self.axes)} and only one can '
+                             f'be used here: choose it, like --axis {self.axes[0]}')
         if axis and axis not in self.axes:
             raise InputError(_no_such_axis(axis, self.axes))
         return _merged(self.path, [section for section in self.sections if section.is_for(axis)])
@@ -263,8 +258,7 @@ def config_text(parameters: Parameters) -> str:
         of_joint = parameters.of_joint(joint)
         of_all[joint] = _tree(of_joint, (
             p.name for p in common if CONTROLLER in p.used_by and not p.per_node
-            and of_joint[p.name] != parameters[p.name]
-        ))
+            and of_joint[p.name] != parameters[p.name]))
     document = {f'/{ANY}': {'ros__parameters': of_all}}
     if own:
         document[f'/{BRINGUP}'] = {'ros__parameters': _tree(parameters, own)}

@@ -53,10 +53,8 @@ def read_run(
     if file is None:
         raise InputError(f'{path}: holds no bag, no {RECORD_FILE} and no {SAMPLES_FILE}')
     if file.suffix not in ('.npz', '.csv'):
-        raise InputError(
-            f'{path}: is neither a bag (its folder, .mcap or .db3) nor a folder of results, '
-            f'{RECORD_FILE} or {SAMPLES_FILE}'
-        )
+        raise InputError(f'{path}: is neither a bag (its folder, .mcap or .db3) nor a folder of '
+                         f'results, {RECORD_FILE} or {SAMPLES_FILE}')
     record = files.read_record(file) if file.suffix == '.npz' else files.read_samples(file, period)
     if span == WHOLE_SPAN:
         return Run(record, parameters)
@@ -123,9 +121,8 @@ def choose_namespace(names: Sequence[str], axis: str) -> tuple[str, str]:
     axes = [name.strip('/').split('/')[0] for name in names]
     if axis or not names:
         return names[axes.index(axis)] if axis in axes else '', ''
-    return names[0], '' if len(names) == 1 else (
-        f'the bag holds {", ".join(names)}: this is {axes[0]}; --axis {axes[1]} chooses another one'
-    )
+    others = f'; --axis {axes[-1]} chooses another one' if axes[1:] else ''
+    return names[0], others and f'the bag holds {", ".join(names)}: this is {axes[0]}{others}'
 
 
 def topic_ends_like(name: str, topic: str) -> bool:
