@@ -119,7 +119,6 @@ def run_jobs(
     finished = _on_cluster(jobs, cluster) if cluster is not None else \
         _in_processes(jobs, workers) if workers > 1 else \
         ((i, run_job(job)) for i, job in enumerate(jobs))
-    # disable=None: no bar where stderr is not a terminal.
     with closing(finished), \
             tqdm(finished, desc=label, total=len(jobs), unit='run', disable=None) as bar:
         outcomes = dict(bar)
@@ -175,7 +174,6 @@ def _on_cluster(jobs: Sequence[Job], address: str) -> Finished:
         raise InputError(
             "--cluster needs Dask, which is not installed: pip install 'backlash_ros[cluster]'"
         ) from None
-    # The errors below say in one line what the user needs to know.
     logging.getLogger('distributed').setLevel(logging.CRITICAL)
     here, there = libraries(), f'--cluster {address}'
     try:

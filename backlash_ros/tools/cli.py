@@ -35,7 +35,6 @@ class Span(NamedTuple):
 
 
 WHOLE_SPAN = Span()
-# What several tools offer, by the name of the option.
 OPTIONS: dict[str, dict[str, Any]] = {
     '--config': {'type': Path, 'metavar': 'FILE', 'help': 'parameter file, or the name of a '
                  "shipped one (default: that beside a recorded run, or the paper's example)"},

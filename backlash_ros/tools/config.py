@@ -132,7 +132,6 @@ def parse_setting(text: str) -> Setting:
     if axis and name == 'axes':
         raise ParameterError(name, given, 'is for the whole run', 'write --set axes=...')
     try:
-        # A word is taken as it is.
         value = given if isinstance(BY_NAME[name].default, str) else yaml.safe_load(given)
     except yaml.YAMLError:
         raise ParameterError(name, given, 'is not a value in YAML') from None
@@ -151,7 +150,6 @@ def _merged(path: Path, sections: Sequence[Section]) -> dict[str, Value]:
     """The values of sections, of each name those of the most specific; raises InputError."""
     merged: dict[str, Value] = {}
     ranks: dict[str, tuple[bool, bool]] = {}
-    # A named node goes before a named axis.
     ranked = [((s.node != ANY, s.axis not in (ANY, '')), s.values) for s in sections]
     for rank, values in sorted(ranked, key=lambda each: each[0], reverse=True):
         for name, value in values.items():

@@ -161,7 +161,6 @@ def plan_processes(plan: RunPlan, domain: int | None) -> list[list[Child]]:
                     grace_s=p.timeout.ramp if node == 'controller' else 0.0))
         if p.driver and p.driver != ELSEWHERE:
             served.setdefault(p.driver, []).append(axis)
-    # Axes with the very same command have one driver together.
     for command, axes in served.items():
         name, log = axes[0].process_name('driver'), axes[0].logs / 'driver.log'
         if len(axes) > 1:

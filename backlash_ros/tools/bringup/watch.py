@@ -258,7 +258,6 @@ def report(axis: AxisPlan) -> bool:
         print(axis.titled(f'no bag and no report (--no-record), logs in {axis.logs}'))
         return True
     good = True
-    # Joints have a folder each.
     for joint in axis.parameters.joint_names:
         out = axis.out / joint
         try:
@@ -269,8 +268,8 @@ def report(axis: AxisPlan) -> bool:
             good = False
             continue
         print(estimate_table(summary, '/'.join(filter(None, (axis.name, joint)))))
-        facts = f'{summary["samples"]} samples, {summary["lost_samples"]} lost'
-        if latency := summary['loop_latency_ms']:
-            facts += f', y to v within {latency["p50"]:.2f} ms (p50), {latency["p99"]:.2f} ms (p99)'
-        print(f'{facts}\nreport: {out / REPORT_PAGE}')
+        latency = summary['loop_latency_ms']
+        print(f'{summary["samples"]} samples, {summary["lost_samples"]} lost', *(
+            f'y to v within {latency[each]:.2f} ms ({each})' for each in latency or ()), sep=', ')
+        print(f'report: {out / REPORT_PAGE}')
     return good

@@ -49,7 +49,6 @@ def summarise(
     status = status[np.isfinite(status)]
     words = {float(state): state.word for state in Status}
     latency = np.empty(0) if latency_s is None else latency_s[np.isfinite(latency_s)]
-    # The estimates of the first command, and where they are from.
     began: dict[str, Any] = {name: float(run.column(name)[0]) for name in (*BACKLASH, 'f')}
     began['from'] = None
     if parameters is not None:
