@@ -11,9 +11,8 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from backlash_ros import topics
-from backlash_ros.core.loop.learned_model import LearnedModel
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
+from backlash_ros.core.simulation.run_record import COLUMNS, LearnedModel, RunRecord
 
 PARAMETERS = Parameters({'estimator.law': 'lms', 'output_noise_std': 1e-4})
 LATENCY_S = 0.0004

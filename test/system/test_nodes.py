@@ -20,8 +20,8 @@ from ros_processes import NodeProcess, ros_world, wait_until
 from std_msgs.msg import Float32, Float64, Float64MultiArray
 
 from backlash_ros import topics
-from backlash_ros.core.loop.learned_model import from_fields
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.simulation.run_record import from_fields
 
 TYPES = {'std_msgs/msg/Float64': Float64, 'std_msgs/msg/Float64MultiArray': Float64MultiArray}
 # What the shipped layouts draw: PlotJuggler writes /topic/field[0], Foxglove /topic.field[0].

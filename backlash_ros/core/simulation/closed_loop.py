@@ -15,10 +15,9 @@ from backlash_ros.core.assembly import build_controller, build_plant, build_refe
 from backlash_ros.core.control.controller import LONGEST_GAP, AdaptiveController
 from backlash_ros.core.control.limits import plausible
 from backlash_ros.core.loop.command_history import ReportOrigin, ReportTrust, report_use
-from backlash_ros.core.loop.learned_model import learned_model_of
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.simulated_plant import SimulatedPlant
-from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord, row_of
+from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord, learned_model_of, row_of
 
 
 @dataclass

@@ -16,10 +16,9 @@ from std_msgs.msg import Float64, Float64MultiArray, MultiArrayDimension
 from backlash_ros import topics
 from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.loop.control_loop import ControlLoop
-from backlash_ros.core.loop.learned_model import learned_model_of
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.transfer_function import StateModel
-from backlash_ros.core.simulation.run_record import stated_deviations
+from backlash_ros.core.simulation.run_record import learned_model_of, stated_deviations
 from backlash_ros.nodes.runtime.messages import NO_EVENTS, LabelledArrayPublisher
 
 Row = tuple[float, ...]

@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.atomic_file import point_link, write_atomically
-from backlash_ros.core.loop.learned_model import from_fields
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
+from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord, from_fields
 from backlash_ros.tools.cli import InputError
 
 SAMPLES_FILE, RECORD_FILE = 'samples.csv', 'record.npz'

@@ -15,9 +15,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from backlash_ros import topics
 from backlash_ros.bags import REPAIR_COMMAND, BagError, BagReader, Topic, is_bag
-from backlash_ros.core.loop.learned_model import LearnedModel, from_fields
 from backlash_ros.core.simulation.closed_loop import ClosedLoop
-from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
+from backlash_ros.core.simulation.run_record import COLUMNS, LearnedModel, RunRecord, from_fields
 from backlash_ros.tools.cli import WHOLE_SPAN, BrokenOffError, InputError, Span
 from backlash_ros.tools.config import read_configuration
 from backlash_ros.tools.runs import files

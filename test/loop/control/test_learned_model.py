@@ -27,15 +27,15 @@ from backlash_ros.core.control.tracking.design import (
 from backlash_ros.core.control.tracking.tracking import Tracking
 from backlash_ros.core.law import Interval, Law, LawReport
 from backlash_ros.core.laws.fixed import FixedBacklash
-from backlash_ros.core.loop.learned_model import (
+from backlash_ros.core.plant.simulated_plant import SimulatedPlant
+from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
+from backlash_ros.core.simulation.closed_loop import ClosedLoop
+from backlash_ros.core.simulation.run_record import (
     FREQUENCIES,
     LearnedModel,
     from_fields,
     learned_model_of,
 )
-from backlash_ros.core.plant.simulated_plant import SimulatedPlant
-from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
-from backlash_ros.core.simulation.closed_loop import ClosedLoop
 
 MOTOR = Parameters({
     'sample_period': 0.005, 'plant.numerator': [0.1513, 0.1325],

@@ -10,8 +10,8 @@ import pytest
 
 from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core import Parameters, build_closed_loop
-from backlash_ros.core.loop.learned_model import LearnedModel
 from backlash_ros.core.simulation import run_record
+from backlash_ros.core.simulation.run_record import LearnedModel
 from backlash_ros.tools.cli import InputError
 from backlash_ros.tools.runs import files as results
 from backlash_ros.tools.runs.summary import summarise
