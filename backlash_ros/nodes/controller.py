@@ -119,8 +119,6 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
     def configured(self) -> list[ControlLoop]:
         return [] if self.loops is None else list(self.loops.loops)
 
-    # --- the life cycle --------------------------------------------------------------------------
-
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         try:
             before = {joint.name: assembly.known_before(joint.p) for joint in self.joints}
@@ -247,8 +245,6 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
             joint.close()
         self._executor.close()
 
-    # --- at every sample -------------------------------------------------------------------------
-
     def _on_reference(self, y_m: Mapping[str, float]) -> None:
         if self.loops is None:
             return
@@ -304,8 +300,6 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
                 joint.model.follow(loops.by_name[joint.name], joint.p)
         if news := next((joint for joint in self.joints if joint.told != joint.state), None):
             self._diagnose(news)
-
-    # --- what happens besides --------------------------------------------------------------------
 
     def is_configured(self) -> bool:
         return self.loops is not None
