@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
 from math import isfinite, isnan
@@ -23,7 +23,7 @@ from backlash_ros.core.parameters import NOISE, ParameterError, Parameters
 from backlash_ros.core.simulation.run_record import stated_deviations
 from backlash_ros.nodes.control.publishing import ModelPublisher
 from backlash_ros.nodes.control.rivals import name_of
-from backlash_ros.nodes.runtime.driver_io import DriverIo, DriverTopics, output_qos
+from backlash_ros.nodes.runtime.driver_io import DriverIo, output_qos
 from backlash_ros.nodes.runtime.messages import DEPTH, DiagnosticsPublisher, name_of_type
 from backlash_ros.nodes.runtime.process import ProcessNode
 
@@ -191,30 +191,29 @@ def neighbours_of(
     """Who is on the topics of the controller. rivals: who else publishes v."""
     to, own, publishers = io.topics, node.get_fully_qualified_name(), \
         node.get_publishers_info_by_topic
+
+    def peers_on(
+        topic: str, infos: list[TopicEndpointInfo],
+        offered_and_wanted: Callable[[QoSProfile], tuple[QoSProfile, QoSProfile]],
+    ) -> diagnosis.TopicFigures:
+        peers, kind = [], to.types[topic]
+        for info in infos:
+            (offers, wants), unfit = offered_and_wanted(info.qos_profile), ''
+            if info.topic_type != name_of_type(kind):
+                unfit = 'type'
+            elif qos_check_compatible(offers, wants)[0] == QoSCompatibility.ERROR:
+                unreliable = offers.reliability == ReliabilityPolicy.BEST_EFFORT \
+                    and wants.reliability == ReliabilityPolicy.RELIABLE
+                unfit = 'reliability' if unreliable else 'qos'
+            has_kind = str(info.topic_type).rsplit('/', 1)[-1]
+            peers.append(diagnosis.Peer(name_of(info), has_kind, unfit))
+        return diagnosis.TopicFigures(topic, kind.__name__, tuple(peers))
+
     # As the middleware has it: rclpy keeps what was asked for, with zeros for "no limit".
     offered = [i.qos_profile for i in publishers(to.control) if name_of(i) == own]
     heard = node.get_subscriptions_info_by_topic(to.control) if offered else []
     return diagnosis.Neighbours(
-        _peers_on(to, to.output, publishers(to.output), wanted=output_qos(p, DEPTH)),
-        _peers_on(to, to.reference, publishers(to.reference), wanted=io.reference_qos),
-        _peers_on(to, to.control, heard, *offered[:1]), rivals,
+        peers_on(to.output, publishers(to.output), lambda qos: (qos, output_qos(p, DEPTH))),
+        peers_on(to.reference, publishers(to.reference), lambda qos: (qos, io.reference_qos)),
+        peers_on(to.control, heard, lambda qos: (offered[0], qos)), rivals,
     )
-
-
-def _peers_on(
-    to: DriverTopics, topic: str, infos: list[TopicEndpointInfo],
-    offered: QoSProfile | None = None, wanted: QoSProfile | None = None,
-) -> diagnosis.TopicFigures:
-    wanted_type = name_of_type(to.types[topic])
-
-    def peer(info: TopicEndpointInfo) -> diagnosis.Peer:
-        offers, wants, unfit = offered or info.qos_profile, wanted or info.qos_profile, ''
-        if info.topic_type != wanted_type:
-            unfit = 'type'
-        elif qos_check_compatible(offers, wants)[0] == QoSCompatibility.ERROR:
-            unreliable = offers.reliability == ReliabilityPolicy.BEST_EFFORT \
-                and wants.reliability == ReliabilityPolicy.RELIABLE
-            unfit = 'reliability' if unreliable else 'qos'
-        return diagnosis.Peer(name_of(info), str(info.topic_type).rsplit('/', 1)[-1], unfit)
-
-    return diagnosis.TopicFigures(topic, to.types[topic].__name__, tuple(map(peer, infos)))
