@@ -46,15 +46,18 @@ def test_nothing_is_loaded_unless_asked_or_before_it_was_saved(tmp_path: Path) -
         load_estimate(Parameters({'estimates.load': True}))
 
 
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / 'estimates.json'
+    save_estimate(path, LEARNED, parameters(path))
+    return path
+
+
 @pytest.mark.parametrize(('name', 'value'), [
-    ('sample_period', 0.02),
-    ('plant.numerator', [1e-5, 4e-5, 2e-5]),
-    ('control.delay_samples', 1),
-    ('estimator.law', 'lms'),
+    ('sample_period', 0.02), ('plant.numerator', [1e-5, 4e-5, 2e-5]),
+    ('control.delay_samples', 1), ('estimator.law', 'lms'),
 ])
-def test_estimates_of_another_plant_or_law_are_refused(tmp_path, name, value):
-    file = tmp_path / 'estimates.json'
-    save_estimate(file, LEARNED, parameters(file))
+def test_estimates_of_another_plant_or_law_are_refused(file, name, value):
     with pytest.raises(ParameterError, match=f'was learned with {name}='):
         load_estimate(parameters(file, **{name: value}))
 
@@ -62,8 +65,7 @@ def test_estimates_of_another_plant_or_law_are_refused(tmp_path, name, value):
 @pytest.mark.parametrize(('std', 'reason'), [
     (0.01, ''), (None, ''), (0.0, 'holds constants that were given'),
 ])
-def test_constants_that_were_learned_serve_the_law_that_learns_none(tmp_path, std, reason):
-    file = tmp_path / 'estimates.json'
+def test_constants_that_were_learned_serve_the_law_that_learns_none(file, std, reason):
     deviation = nan if std is None else std
     learned = replace(LEARNED, std_m=deviation, std_c_r=deviation, std_c_l=deviation)
     save_estimate(file, learned, parameters(file))
@@ -79,8 +81,7 @@ def test_constants_that_were_learned_serve_the_law_that_learns_none(tmp_path, st
     '', '{', '[]', '3', '{"version": 1}', 'null', '{"version": 1, "key": {}, "estimate": 2}',
     '{"version": 1, "key": {}, "estimate": {"m": "1"}}', '\x00', '"estimate"',
 ])
-def test_a_broken_file_is_refused_in_one_sentence(tmp_path: Path, content: str) -> None:
-    file = tmp_path / 'estimates.json'
+def test_a_broken_file_is_refused_in_one_sentence(file: Path, content: str) -> None:
     file.write_text(content)
     with pytest.raises(ParameterError, match=r'estimates\.file='):
         load_estimate(parameters(file))
@@ -90,9 +91,7 @@ def test_a_broken_file_is_refused_in_one_sentence(tmp_path: Path, content: str) 
     ('m', 1000.0, 'outside of estimator.bounds.m'), ('c_r', -1000.0, 'outside'),
     ('c_r', -4.0, 'c_l=-3.5 above c_r=-4.0'), ('c_l', None, 'no finite c_l'),
 ])
-def test_values_that_cannot_be_are_refused(tmp_path, part, value, reason):
-    file = tmp_path / 'estimates.json'
-    save_estimate(file, LEARNED, parameters(file))
+def test_values_that_cannot_be_are_refused(file, part, value, reason):
     content = json.loads(file.read_text())
     content['estimate'][part] = value
     file.write_text(json.dumps(content))
@@ -108,9 +107,8 @@ def test_a_first_guess_is_not_worth_saving() -> None:
     assert worth_saving(replace(LEARNED, status=Status.INCONSISTENT))
 
 
-def test_whoever_builds_a_controller_begins_with_what_was_known(tmp_path: Path) -> None:
-    p = parameters(tmp_path / 'estimates.json')
-    save_estimate(Path(p.estimates.file), LEARNED, p)
+def test_whoever_builds_a_controller_begins_with_what_was_known(file: Path) -> None:
+    p = parameters(file)
     assert build_controller(p).estimator.estimate.c_r == LEARNED.c_r
     run = build_closed_loop(p).run(30)
     assert run.column('c_l')[0] == LEARNED.c_l

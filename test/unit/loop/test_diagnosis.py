@@ -242,33 +242,26 @@ def test_a_driver_that_pauses_now_and_then_is_not_asked_for_another_rate() -> No
         'plant_output comes at 197.6 Hz, sample_period is 0.005 s (200 Hz): is the driver held up?'
 
 
-@pytest.mark.parametrize('intervals_s', [
-    (0.005, 0.0072, 0.01),  # a third is lost
-    (0.005, 0.008, 0.02),  # the driver stands still now and then
-    (0.0001, 0.0025, 0.005),  # each is sent twice
-    (0.0053, 0.0054, 0.0055), (nan, nan, nan),
+@pytest.mark.parametrize('changes', [
+    {'intervals_s': (0.005, 0.0072, 0.01)},  # a third is lost
+    {'intervals_s': (0.005, 0.008, 0.02)},  # the driver stands still now and then
+    {'intervals_s': (0.0001, 0.0025, 0.005)},  # each is sent twice
+    {'intervals_s': (0.0053, 0.0054, 0.0055)}, {'intervals_s': (nan, nan, nan)},
+    {'still': 2000, 'v_swing': 0.9, 'gap': 1.0}, {'still': 5, 'v_swing': 3.0, 'gap': 1.0},
+    {'still': 500, 'v_swing': 3.0},  # nobody knows the gap yet
 ])
-def test_losses_bursts_and_jitter_are_no_wrong_rate(intervals_s):
-    assert first(replace(WELL, intervals_s=intervals_s)) == LEARNED
+def test_losses_jitter_and_a_sensor_at_rest_with_v_inside_the_gap_are_no_fault(changes):
+    assert first(replace(WELL, **changes)) == LEARNED
 
 
-def test_held_learning_is_told_from_a_state_of_the_estimator() -> None:
-    held = replace(WELL, adapting=False)
-    assert first(held).text.startswith('estimates held as ~/freeze_adaptation asked')
-    assert first(replace(held, status=Status.INCONSISTENT)).level == Level.ERROR
-
-
-def test_constants_that_were_given_are_not_called_learned() -> None:
-    given = replace(WELL, given=True)
-    assert first(given).text.startswith('estimates as given')
-    assert first(replace(given, late=60)).text.startswith('10 % of control came too late')
-
-
-def test_a_sensor_at_rest_with_v_inside_the_gap_is_no_fault() -> None:
-    assert first(replace(WELL, still=2000, v_swing=0.9, gap=1.0)) == LEARNED
-    assert first(replace(WELL, still=5, v_swing=3.0, gap=1.0)) == LEARNED
-    # Nobody knows the gap yet.
-    assert first(replace(WELL, still=500, v_swing=3.0)) == LEARNED
+@pytest.mark.parametrize(('changes', 'text', 'trouble', 'level'), [
+    ({'adapting': False}, 'estimates held as ~/freeze_adaptation asked',
+     {'status': Status.INCONSISTENT}, Level.ERROR),
+    ({'given': True}, 'estimates as given', {'late': 60}, Level.WARN),
+])
+def test_what_is_held_or_given_is_not_called_learned(changes, text, trouble, level):
+    assert first(replace(WELL, **changes)).text.startswith(text)
+    assert first(replace(WELL, **changes, **trouble)).level == level
 
 
 def test_long_names_of_topics_and_nodes_leave_the_cure_in_place() -> None:
