@@ -22,8 +22,7 @@ from backlash_ros.core.loop.sample_counter import UNNUMBERED, SampleCounter
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.transfer_function import TransferFunction
 from backlash_ros.core.record_fit import fit_record
-from backlash_ros.core.records.readings import own_readings
-from backlash_ros.core.records.samples import frequencies_of
+from backlash_ros.core.records.readings import frequencies_of, own_readings
 
 Array = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from backlash_ros.core.estimation import explanations, settings
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.posterior import WindowFit
 from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
-from backlash_ros.core.records.samples import check_record, outliers
+from backlash_ros.core.records.readings import check_record, outliers
 from backlash_ros.core.simulation.run_record import turns
 
 Array = NDArray[np.float64]

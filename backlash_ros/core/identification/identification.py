@@ -23,8 +23,7 @@ from backlash_ros.core.identification.not_play import Observed, limited, rate_li
 from backlash_ros.core.identification.structure_search import Options, StructureSearch, Units
 from backlash_ros.core.identification.verdict import CERTAIN, Findings, Verdict, judge
 from backlash_ros.core.plant.actuator import Actuator
-from backlash_ros.core.records.readings import quantum
-from backlash_ros.core.records.samples import busiest, check_record, frequencies_of
+from backlash_ros.core.records.readings import busiest, check_record, frequencies_of, quantum
 
 Array = NDArray[np.float64]
 

@@ -36,8 +36,7 @@ from backlash_ros.core.identification.model import (
 from backlash_ros.core.identification.not_play import Observed, what_it_is
 from backlash_ros.core.identification.verdict import ANOTHER
 from backlash_ros.core.plant.numerics import lfilter
-from backlash_ros.core.records.readings import quantum
-from backlash_ros.core.records.samples import noise_of, outliers
+from backlash_ros.core.records.readings import noise_of, outliers, quantum
 
 Array = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from backlash_ros.core.control.limits import LARGEST_SIGNAL
 from backlash_ros.core.loop.command_history import v_of_intervals
 from backlash_ros.core.loop.sample_counter import CLOCK_SLACK, JITTER
-from backlash_ros.core.records import readings, samples, stamps
+from backlash_ros.core.records import readings, stamps
 from backlash_ros.core.records.record import Record, RecordError, seconds
 
 Array = NDArray[np.float64]
@@ -60,11 +60,7 @@ def record_of(
     times = stamps.in_seconds(t, len(v), period, unit_s, said)
     # t, v, y and the commands, a row each.
     table = np.array([times, v, y] if commands is None else [times, v, y, commands])
-    for name, values in zip('vy', table[1:3], strict=True):
-        infinite = np.isinf(values)
-        if infinite.any():
-            notes.append(f'{name} is infinite in {infinite.sum()} rows: taken as lost')
-            values[infinite] = np.nan
+    table[1:3][np.isinf(table[1:3])] = np.nan
     table = table[:, stamps.in_order(times, said)]
     _check(v=table[1], y=table[2])
     sent = None
@@ -178,7 +174,7 @@ def on_grid(rows: Rows, period: float | None = None, late: bool = False) -> Reco
         found = _along(_numbered(rows.t / period), rows.t)
     # Too many may be missing, or too late, to be numbered.
     if found.numbers[-1] + 1 <= 1.3 * len(rows.t) and np.std(found.off) <= found.period and sum(
-            samples.rougher(rows.t, found.numbers.astype(float), signal)
+            readings.rougher(rows.t, found.numbers.astype(float), signal)
             for signal in (rows.y, rows.v) if signal.ndim == 1) > 0.05:
         return _numbered_grid(
             rows, found.numbers, used, f'{cut}stamps are uneven by {percent} of {seconds(used)}, '
@@ -298,8 +294,8 @@ def _true_instants(rows: Rows, begin: float, period: float, said: str) -> Record
     said += f'; {equal} rows with equal stamps' if equal else ''
     kept = np.append(np.diff(t) > 0.0, True)
     t, y = t[kept], y[kept]
-    noise = samples.noise_of(t, y)
-    bend = samples.curvature_of(t, y, noise)
+    noise = readings.noise_of(t, y)
+    bend = readings.curvature_of(t, y, noise)
     swing = float(np.ptp(np.percentile(y, [5.0, 95.0])))
     noise = max(noise, 12.0**-0.5 * readings.quantum(y), 0.01 * least * swing)
     for parts in (1, 2, 4):

@@ -9,7 +9,7 @@ from records import PERIOD_S, Truth, output, resonance, swing
 from backlash_ros.core.estimate import Bounds
 from backlash_ros.core.plant.transfer_function import TransferFunction
 from backlash_ros.core.record_fit import RecordFit, fit_record
-from backlash_ros.core.records.samples import SEARCHED_AT_MOST
+from backlash_ros.core.records.readings import SEARCHED_AT_MOST
 
 NOISE = 1e-3
 TRUTH = Truth()
