@@ -241,37 +241,12 @@ def _end(o: Observed, at: At) -> str:
             'the sensor is at its end, or the load slides there')
 
 
-def _dead(v: Array, low: float, high: float) -> Array:
-    return np.asarray(v - np.clip(v, min(low, high), max(low, high)))
-
-
-def _zone(o: Observed, at: At) -> str:
-    low, high = (o.family.low + o.family.swing * end for end in sorted(at))
-    return (f'v does nothing from {low:.4g} to {high:.4g}, from wherever it comes: a dead zone, '
-            'which has no memory, and no backlash')
-
-
-def _compensated(v: Array, width: float) -> Array:
-    """Play, compensated twice."""
-    return np.asarray(2.0 * v - centred(v, width))
-
-
-def _lead(o: Observed, at: At) -> str:
-    return (f'y leads v by {o.family.swing * abs(at[0]):.3g} where v turns: the drive compensates '
-            'a backlash already, by too much') * (abs(at[0]) > abs(o.one_play.at[0]) + 0.002)
-
-
 def _many(v: Array, widest: float, share: float) -> Array:
     """Plays of all widths up to the widest in parallel, and a share of v itself beside them."""
     widths = abs(widest) * np.linspace(0.04, 0.96, 12, dtype=np.float64)
     held = play(v, widths, v[0] + 0.5 * widths) - 0.5 * widths[:, None]
     share = min(max(share, 0.0), 1.0)
     return np.asarray(share * v + (1.0 - share) * held.mean(axis=0))
-
-
-def _widest(o: Observed, at: At) -> str:
-    return (f'many plays in parallel explain it, up to {o.family.swing * abs(at[0]):.3g} wide: y '
-            'turns smoothly, as with friction along the way or in a piezo')
 
 
 def _sticking(v: Array, band: float, jump: float) -> Array:
@@ -290,13 +265,6 @@ def _sticking(v: Array, band: float, jump: float) -> Array:
         last = value
         out.append(place)
     return np.array(out)
-
-
-def _stuck(o: Observed, at: At) -> str:
-    band, jump = abs(at[0]), min(abs(at[1]), abs(at[0]))
-    return (f'y sticks until v has gone on by {o.family.swing * band:.3g} behind each turn, and '
-            f'jumps by what {o.family.swing * jump:.3g} of v move: friction, as in a valve') * (
-                jump > 0.1 * band)
 
 
 # --- what moves y beside v ------------------------------------------------------------------------
@@ -336,23 +304,32 @@ def _creep(o: Observed) -> str:
 
 # --- what is compared -----------------------------------------------------------------------------
 
-# A nonlinearity, where to begin (of the width of the best play), what to say of it, and the cure.
+# A nonlinearity, where to begin (of the width of the best play), what to say of it by its sizes [v]
+# and ends [v], and the cure.
 NONLINEARITIES: tuple[tuple[
-    Callable[..., Array], Callable[[float], Sequence[At]], Callable[[Observed, At], str], str], ...
+    Callable[..., Array], Callable[[float], Sequence[At]], str, str], ...
 ] = (
     (_ended, lambda width: [
         (one, low, high) for one in (width, 0.0)
         for low, high in ((-1.0, 0.75), (0.25, 2.0), (0.2, 0.8), (0.35, 0.65))],
-     _end, 'move v less far'),
-    (_dead, lambda _: [(middle - half, middle + half) for middle in (0.3, 0.5, 0.7)
-                       for half in (0.03, 0.1, 0.2, 0.3)],
-     _zone, 'remove it where it is made, it is not compensated here'),
-    (_compensated, lambda _: [(width,) for width in (0.003, 0.01, 0.03, 0.1, 0.2, 0.4)],
-     _lead, 'switch that off, or leave it to it'),
+     '', 'move v less far'),
+    (lambda v, low, high: v - np.clip(v, min(low, high), max(low, high)),
+     lambda _: [(middle - half, middle + half) for middle in (0.3, 0.5, 0.7)
+                for half in (0.03, 0.1, 0.2, 0.3)],
+     'v does nothing from {ends[0]:.4g} to {ends[1]:.4g}, from wherever it comes: a dead zone, '
+     'which has no memory, and no backlash', 'remove it where it is made, it is not compensated '
+     'here'),
+    (lambda v, width: 2.0 * v - centred(v, width),  # play, compensated twice
+     lambda _: [(width,) for width in (0.003, 0.01, 0.03, 0.1, 0.2, 0.4)],
+     'y leads v by {:.3g} where v turns: the drive compensates a backlash already, by too much',
+     'switch that off, or leave it to it'),
     (_many, lambda _: [(widest, share) for widest in (0.1, 0.3, 0.7) for share in (0.0, 0.4)],
-     _widest, 'only a single backlash is compensated here'),
+     'many plays in parallel explain it, up to {:.3g} wide: y turns smoothly, as with friction '
+     'along the way or in a piezo', 'only a single backlash is compensated here'),
     (_sticking, lambda width: [(wider * width, share * width) for wider, share in (
-        (1.05, 0.1), (1.3, 0.4), (1.3, 0.8), (1.0, 0.6))], _stuck, 'loosen it'),
+        (1.05, 0.1), (1.3, 0.4), (1.3, 0.8), (1.0, 0.6))],
+     'y sticks until v has gone on by {:.3g} behind each turn, and jumps by what {:.3g} of v move: '
+     'friction, as in a valve', 'loosen it'),
 )
 BESIDE_V = ((_pushed, 'hold it, or keep it free'),
             (_creep, 'mend what slips, or measure y without a drift'))
@@ -368,9 +345,11 @@ def what_it_is(o: Observed) -> Answer | None:
 
 def best_other(o: Observed) -> Answer | None:
     """The best of the nonlinearities that explain y far better than a play does."""
-    named = []
+    f, named = o.family, []
     for nonlinearity, starts, said, cure in NONLINEARITIES:
-        best = o.family.best(nonlinearity, starts(abs(o.one_play.at[0])))
-        if o.family.beats(best, o.one_play, o.noise):
-            named.append((best.squares, said(o, best.at), cure))
+        best = f.best(nonlinearity, starts(abs(o.one_play.at[0])))
+        if f.beats(best, o.one_play, o.noise):
+            text = said.format(*(f.swing * abs(x) for x in best.at),
+                               ends=sorted(f.low + f.swing * x for x in best.at))
+            named.append((best.squares, text or _end(o, best.at), cure))
     return next((Answer(False, *one[1:]) for one in sorted(named) if one[1]), None)
