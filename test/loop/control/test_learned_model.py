@@ -153,14 +153,6 @@ class Learner(Law):
     def x_cov(self) -> Array:
         return self._observers[self.model].x_cov
 
-    @property
-    def u_hat(self) -> float:
-        return self._observers[self.model].u_hat
-
-    @property
-    def innovation(self) -> float:
-        return self._observers[self.model].innovation
-
     def update(self, y: float | None, interval: Interval) -> None:
         self.samples += 1
         for observer in self._observers.values():

@@ -1,7 +1,7 @@
 """Parts of the nodes on their own: profiles, numbers as bytes, sections, plots, precedence."""
 
 import struct
-from math import inf, isnan, nan
+from math import inf, nan
 from pathlib import Path
 from typing import Any
 
@@ -48,17 +48,10 @@ def test_a_profile_of_the_user_stays(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert chosen({**HERE}) is None
 
 
-NUMBERS = (0.0, -1.5, 1e-300, 12.345678901234567, inf, -inf)
-
-
-@pytest.mark.parametrize('number', NUMBERS)
+@pytest.mark.parametrize('number', [0.0, -1.5, 1e-300, 12.345678901234567, inf, -inf, nan])
 def test_a_number_goes_out_and_comes_in_as_a_float64(number: float) -> None:
-    assert deserialize_message(message_with(number), Float64).data == number
-    assert number_of(serialize_message(Float64(data=number))) == number
-
-
-def test_what_is_no_number_stays_none() -> None:
-    assert isnan(number_of(message_with(nan)))
+    assert repr(deserialize_message(message_with(number), Float64).data) == repr(number)
+    assert repr(number_of(serialize_message(Float64(data=number)))) == repr(number)
 
 
 def test_a_sender_whose_highest_byte_comes_first_is_understood() -> None:
