@@ -99,7 +99,7 @@ class AdaptiveController:
         elif serial is not None:
             used = serial.for_command(estimate)
         gap = used.c_r - used.c_l
-        crossing = max(inverse.samples_across(gap), self.limits.samples_across(gap))
+        crossing = max(gap / inverse.take_up, self.limits.samples_across(gap))
         inputs = ControlInput(y_m, y, used, self._source, crossing)
         u_d, v, f = self.structure.control(inputs, inverse)
         self.motion = self.limits.apply(v, self.motion)

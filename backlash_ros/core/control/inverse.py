@@ -124,10 +124,6 @@ class BacklashInverse:
         """The u that is held while v is on its way across the gap, else the newest."""
         return self._u if self.taking_up else self.extreme
 
-    def samples_across(self, distance: float) -> float:
-        """Samples that v takes across a gap of this width."""
-        return distance / self.take_up if self.take_up < inf else 0.0
-
     def _u_at(self, v: float) -> float:
         m, c_r, c_l = self._play
         return m * (v - (c_r if self.side is Region.RIGHT else c_l))

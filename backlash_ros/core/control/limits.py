@@ -77,8 +77,7 @@ class Limits:
         ahead = target - pace - v
         move = pace + (self._braking(ahead) if ahead > 0.0 else -self._braking(-ahead))
         move = min(max(move, -self.move), self.move)
-        move = min(move, self._most_towards(self.high - v))
-        move = max(move, -self._most_towards(v - self.low))
+        move = max(min(move, self._braking(self.high - v)), -self._braking(v - self.low))
         move = min(max(move, before.move - most), before.move + most)
         sent = v + move
         # But for rounding v has arrived.
@@ -97,18 +96,14 @@ class Limits:
     def samples_across(self, distance: float) -> float:
         """Samples that a move of v over a distance >= 0 takes from rest to rest."""
         if self.acceleration == inf:
-            return distance / self.move if self.move < inf else 0.0
+            return distance / self.move
         fastest = min(self.move, sqrt(distance * self.acceleration))
         return distance / fastest + fastest / self.acceleration if fastest > 0.0 else 0.0
 
-    def _most_towards(self, distance: float) -> float:
-        """The largest move towards a bound; < 0 beyond it, as after bounds were narrowed."""
-        if distance >= 0.0:
-            return self._braking(distance)
-        return -min(self._braking(-distance), self.move)
-
     def _braking(self, distance: float) -> float:
-        """The largest move now after which v can still come to rest within a distance >= 0."""
+        """The largest move now after which v can still come to rest within a distance."""
+        if distance < 0.0:  # beyond a bound, as after bounds were narrowed
+            return -min(self._braking(-distance), self.move)
         # A move of (n + f) times the acceleration takes n (n+1)/2 + (n+1) f of it until v rests.
         way = distance / self.acceleration
         if way == inf:

@@ -77,7 +77,7 @@ class StateFeedback:
 
     def __init__(self, design: TrackingDesign, shrinkage: float, noise_std: float) -> None:
         self.trust, self.state = Trust(), FeedbackState()
-        self._shrinkage, self._y_std = shrinkage, noise_std
+        self._shrinkage, self.y_std = shrinkage, noise_std
         self._newest: Estimate | None = None
         self.gap_u = 0.0  # that the gap takes
         self.use(design)
@@ -85,7 +85,7 @@ class StateFeedback:
     def use(self, design: TrackingDesign) -> None:
         """Use these gains."""
         self._design = design
-        self._least = 0.5 * self._y_std * np.array([hypot(*gain) for gain in design.schedule])
+        self._least = 0.5 * self.y_std * np.array([hypot(*gain) for gain in design.schedule])
         self.noise = DeviationNoise(self._least.tolist())
         # Places in the schedule: of the gain that its noise asks for, and of the one in use.
         self._quiet = self._in_use = 0
@@ -93,7 +93,7 @@ class StateFeedback:
     def go_on_from(self, other: StateFeedback, state_known: bool) -> None:
         """Go on where another one is; from the softest, where x_hat begins anew, full of noise."""
         self.trust, self.state, self.gap_u = other.trust, other.state, other.gap_u
-        self.prepare(other.noise.x_cov, self._y_std)
+        self.prepare(other.noise.x_cov, self.y_std)
         if not state_known:
             self.trust = Trust(sharp_counts=1)
             self.state = replace(self.state, width=1.0, asked=0.0, bounded=False,
@@ -240,7 +240,7 @@ class StateFeedback:
             # A wrong slope may make the loop unstable, which bounded feedback slows down.
             return self.state.width * self._scale
         # No error of y that would not matter at rest calls for too much; |K| is what it calls for.
-        by_noise = TOLERANCE * self._y_std * hypot(*self._design.schedule[0])
+        by_noise = TOLERANCE * self.y_std * hypot(*self._design.schedule[0])
         return LARGEST_FEEDBACK * max(self._scale, by_noise)
 
     @property

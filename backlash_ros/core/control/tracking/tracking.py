@@ -49,19 +49,16 @@ class Tracking(ControlStructure):
         self, beginning: TrackingDesign, weights: Weights, shrinkage: float, noise_std: float = 0.0,
     ) -> None:
         self.delay = weights.preview
-        self._weights, self._told_noise, self._design = weights, noise_std, beginning
+        self._weights, self._design = weights, beginning
         self.trajectory = IdealTrajectory(beginning)
         self.feedback = StateFeedback(beginning, shrinkage, noise_std)
-        self.rest, self.hand_over, self._y_noise = Rest(beginning), HandOver(), NoiseLevel()
+        self.rest, self.hand_over = Rest(beginning), HandOver()
+        self._noise_std, self._y_noise = noise_std, NoiseLevel()
         self._moves = deque([0.0], maxlen=100)  # by which v moved of late, as sizes
         self._engaged_for = 0  # samples since v has crossed the gap
         # y, the covariance of x_hat and who knows both, of a command that the next one was not
         # prepared after.
         self._newest: tuple[float, NDArray[np.float64] | None, StateSource] | None = None
-
-    @property
-    def _noise_std(self) -> float:
-        return max(self._told_noise, self._y_noise.std)
 
     @property
     def may_change(self) -> bool:
@@ -125,9 +122,8 @@ class Tracking(ControlStructure):
         """Return u_d and v = BI(u_d)."""
         y_m, y, estimate, source, crossing = inputs
         self.prepare()
-        feedback, rest, x_cov, references = (
-            self.feedback, self.rest, source.x_cov, self.trajectory.references)
-        first = references.empty
+        feedback, rest, references = self.feedback, self.rest, self.trajectory.references
+        first, x_cov = references.empty, source.x_cov
         self._take_over(y, y_m, estimate, inverse)
         plan = self.trajectory.take(y_m)
         deviation = feedback.deviation(source.x_hat, plan.x)
@@ -148,22 +144,20 @@ class Tracking(ControlStructure):
         mode = rest.decide(y, self._noise_std, references.window.item(0), spread, plan, deviation,
                            None if x_cov is None else feedback.noise.x_std, inverse.side, pull,
                            abs(correction) > noise)
-        side, crossings = inverse.side, feedback.trust.crossings
-        if not mode.steps:
-            side = self._side(turned, u_d, noise, inverse)
-        else:
-            if x_cov is not None:
-                rest.step(estimate, plan.u, plan.noise_band, pull, inverse, mode is not before)
-            elif not before.steps:
-                rest.stay(inverse)
-            u_d = rest.target[0]
-            crossings = shrunk_crossings(estimate, rest.target[1], feedback.trust.known)
-        # Whatever has made u_d: nothing leads it further from what the reference asks for.
+        if mode.steps and x_cov is not None:
+            rest.step(estimate, plan.u, plan.noise_band, pull, inverse, mode is not before)
+        elif mode.steps and not before.steps:
+            rest.stay(inverse)
+        side = self._side(turned, u_d, noise, inverse)
+        # Whatever makes u_d: nothing leads it further from what the reference asks for.
         reach = feedback.reach + (abs(added) if self.hand_over.widens else 0.0)
-        u_d = min(max(u_d, plan.u - reach), plan.u + reach)
-        side_before, v_before, slope = inverse.side, inverse.v, feedback.trust.slope
-        v = inverse.proceed(slope, *crossings) if mode.steps else \
-            inverse.follow(side, u_d, slope, *crossings)
+        u_d = min(max(rest.target[0] if mode.steps else u_d, plan.u - reach), plan.u + reach)
+        side_before, v_before, trust = inverse.side, inverse.v, feedback.trust
+        if mode.steps:
+            shrunk = shrunk_crossings(estimate, rest.target[1], trust.known)
+            v = inverse.proceed(trust.slope, *shrunk)
+        else:
+            v = inverse.follow(side, u_d, trust.slope, *trust.crossings)
         self._moves.append(abs(v - v_before))
         crosses = inverse.taking_up or inverse.side is not side_before
         self._engaged_for = 0 if crosses else self._engaged_for + 1
@@ -177,6 +171,7 @@ class Tracking(ControlStructure):
             y, x_cov, source = self._newest
             self._newest = None
             self._y_noise.take(y)
+            self._noise_std = max(self.feedback.y_std, self._y_noise.std)
             self.trajectory.prepare()
             self.feedback.prepare(x_cov, self._noise_std, *self.trajectory.noise)
             if self.feedback.trust.full and self.trajectory.soften(self.feedback.gap_u):
@@ -206,12 +201,10 @@ class Tracking(ControlStructure):
         self, wanted: float, worth: float, noise: float, deviation: Sequence[float],
         inverse: BacklashInverse,
     ) -> float:
-        """Return u_d: the u that is wanted where that costs no crossing, else what is worth one.
-
-        What is behind the u that is held makes v cross the gap; what is beyond the furthest u* has
-        to come back across it, and has to be more than noise. What is not must not go beyond the
-        trajectory by so much that feedback will want it back either, but for what hands v over.
-        """
+        """Return u_d: the u that is wanted where that costs no crossing, else what is worth one."""
+        # What is behind the u that is held makes v cross the gap; what is beyond the furthest u*
+        # comes back across it, and has to be more than noise. What is not must not go further than
+        # feedback agrees with either, but for what hands v over.
         plan, side, (c_r, c_l) = self.trajectory.state, inverse.side, self.feedback.trust.crossings
         if side is Region.GAP or side is not plan.side or c_r == c_l:
             return worth
@@ -225,11 +218,10 @@ class Tracking(ControlStructure):
         return min(max(wanted * side, least), most) * side
 
     def _side(self, turned: bool, u_d: float, noise: float, inverse: BacklashInverse) -> Region:
-        """Return the side of the gap for u_d.
+        """Return the side of the gap for u_d; turned: whether that of u* is new.
 
-        A crossing costs wear and noise. The trajectory has no noise and is known ahead, so it
-        decides; turned says whether it does since this sample. Feedback may ask for the other side
-        as well, where y is pushed, by more than noise: what of u_d may be noise.
+        The trajectory has no noise and is known ahead, so it decides. Feedback may ask for the
+        other side as well, where y is pushed, by more than the noise in u_d.
         """
         plan, side, (c_r, c_l) = self.trajectory.state, inverse.side, self.feedback.trust.crossings
         asked = plan.side
