@@ -99,39 +99,34 @@ class StateFeedback:
             self.state = replace(self.state, width=1.0, asked=0.0, bounded=False,
                                  blind_for=self._design.model.order)
 
-    def take_estimate(self, estimate: Estimate) -> bool:
-        """Take in the estimate of this sample; returns whether it is another one."""
-        if estimate is self._newest:
-            return False
-        self._newest, trust, status = estimate, self.trust, estimate.status
-        # What was learned before a restart says nothing yet about the state of G. A law without
-        # deviations says by its status alone that it has learned, and holds that later.
-        trust.known = status not in (Status.ACQUIRING, Status.INCONSISTENT) and (
-            trust.known or estimate.learned or status is Status.TRACKING)
-        trust.crossings = shrunk_crossings(estimate, self._shrinkage, trust.known)
-        # On the way to its first agreement with the data the m of a law without deviations may be
-        # anywhere within its bounds.
-        if isnan(trust.slope) or estimate.learned or status is Status.TRACKING:
-            trust.slope = estimate.m
-        return True
-
-    def begin(self, ideal: float, estimate: Estimate, first: bool) -> None:
-        """Note u* of this sample, and count it for the estimate; first: of this loop."""
-        trust, gap = self.trust, estimate.c_r - estimate.c_l
+    def take(self, estimate: Estimate, ideal: float, first: bool) -> bool:
+        """Take in estimate and u* of this sample; returns whether the estimate is another one."""
+        trust, status, gap = self.trust, estimate.status, estimate.c_r - estimate.c_l
+        another, self._newest = estimate is not self._newest, estimate
+        if another:
+            # What was learned before a restart says nothing yet about the state of G. A law without
+            # deviations says by its status alone that it has learned, and holds that later.
+            trust.known = status not in (Status.ACQUIRING, Status.INCONSISTENT) and (
+                trust.known or estimate.learned or status is Status.TRACKING)
+            trust.crossings = shrunk_crossings(estimate, self._shrinkage, trust.known)
+            # On the way to its first agreement with the data the m of such a law may be anywhere.
+            if isnan(trust.slope) or estimate.learned or status is Status.TRACKING:
+                trust.slope = estimate.m
         self.state.asked, self.gap_u = max(self.state.asked, abs(ideal)), estimate.m * gap
         if not (trust.known and estimate.learned):
             # Without deviations nobody knows how far it may be relied on.
             trust.held_for = trust.in_use_for = 0
-            return
+            return another
         trust.in_use_for += 1
-        if first:
-            trust.held_for = TRUSTED_AFTER  # it was known before
+        if first:  # of this loop: it was known before
+            trust.held_for = TRUSTED_AFTER
         elif not trust.full:
             # Beside far larger u even a gap that is hardly known makes little difference.
             large = max(gap, self.state.width * self._scale / estimate.m)
             sharp = (estimate.std_m < SHARP * estimate.m
                      and estimate.std_c_r + estimate.std_c_l < SHARP * large)
             trust.held_for += trust.sharp_counts if sharp else 1
+        return another
 
     def prepare(
         self, x_cov: Array | None, y_std: float, x_noise: Array | None = None,
@@ -163,10 +158,8 @@ class StateFeedback:
             return [0.0] * len(x)
         return [float(x_hat[i]) - each for i, each in enumerate(x)]
 
-    def u(
-        self, deviation: Sequence[float], held_back: bool, largest: float,
-    ) -> tuple[float, float]:
-        """What is taken from u*, and what of it is worth a crossing of the gap.
+    def u(self, error: Sequence[float], held_back: bool, largest: float) -> tuple[float, float]:
+        """What is taken from u* for an error of x, and what of it is worth a crossing of the gap.
 
         held_back: whether v met its limits, or is on its way across the gap. largest: |x*| so far.
         """
@@ -175,7 +168,7 @@ class StateFeedback:
         widening, stiffen_after = 1.03, 20
         state, trust, most, noise = self.state, self.trust, self.most, self.noise
         if trust.held_for:
-            off = hypot(*deviation)
+            off = hypot(*error)
             if held_back or state.bounded:
                 state.free, state.level = 0, min(state.level + 1, SOFTEST)
             else:
@@ -187,12 +180,12 @@ class StateFeedback:
             astray = off > max(largest, ASTRAY / ARRIVED * noise.ignored)
             unproven = SOFTEST - trust.held_for * (SOFTEST + 1) // TRUSTED_AFTER
             self._in_use = max(state.level, unproven, 0 if astray else self._quiet)
-            feedback = worth = dot(self._design.schedule[self._in_use], deviation)
+            feedback = worth = dot(self._design.schedule[self._in_use], error)
             if self.knows_noise:
                 feedback *= 1.0 - noise.ignored / max(off, noise.ignored)
                 worth *= 1.0 - noise.tolerated / max(off, noise.tolerated)
         else:
-            feedback = worth = dot(self._design.acquisition or (), deviation)
+            feedback = worth = dot(self._design.acquisition or (), error)
             if not -most < feedback < most:
                 # A gap wider than the first guess has to be crossed some day.
                 state.width = min(widening * state.width, LARGEST_IN_ACQUISITION)

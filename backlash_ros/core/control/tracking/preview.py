@@ -109,11 +109,10 @@ def _holding(model: TransferFunction, window: int) -> Array:
 
 @lru_cache(maxsize=16)
 def _parabolas(preview: int) -> tuple[Array, list[int], list[int]]:
-    """What parabolas take from 2 H + 1 references, for several widths w <= H to either side.
+    """What of 2 H + 1 references is left beside parabolas through the middle 2 w + 1 of them.
 
-    For each width, one below the other, what is left of the middle 2 w + 1 references beside a
-    parabola through them, weighted by a Hann window, shape (sum (2 w + 1), 2 H + 1); the first row
-    of each; and the widths, none more than a third of the preview.
+    For several widths w <= H, at most a third of the preview, one below the other: shape
+    (sum (2 w + 1), 2 H + 1); then their first rows, and the widths.
     """
     widths = [w for w in (3, 8, 20) if 3 * w <= preview]
     half, sizes = max(widths, default=0), [2 * w + 1 for w in widths]
@@ -152,13 +151,9 @@ class ReferenceWindow:
         # left to the right; when they are full their end moves to the front.
         self._rows: Array = np.zeros((3, 2 * self._kept))
         self._start = self._end = 0
-        self._noise = NoiseLevel()
+        self.noise = NoiseLevel()  # of the references as they came
         self.u_noise_gain = float(noise_gains[0])
         self.u_noise_std = self.noise_spread = self.low = self.high = 0.0
-
-    @property
-    def noise_std(self) -> float:
-        return self._noise.std
 
     @property
     def empty(self) -> bool:
@@ -197,8 +192,8 @@ class ReferenceWindow:
         newest, half = self._end - 1, max(_parabolas(self._preview)[2], default=0)
         self._rows[0, newest] = self._rows[1, newest]
         self._rows[2, newest] = self.noise_gains[0]
-        self._noise.take(self._rows.item(0, newest))
-        std = self._noise.std
+        self.noise.take(self._rows.item(0, newest))
+        std = self.noise.std
         if half and std > 0.0 and newest - self._start >= 2 * half:
             self._average(newest - half)
         window = self.window
@@ -218,7 +213,7 @@ class ReferenceWindow:
         one, none = 1.8, 3.0
         fits, first, widths = _parabolas(self._preview)
         rest = fits @ self._rows[0, at - widths[-1]:at + widths[-1] + 1]
-        of_noise = rest / self._noise.std  # its square may be too small for a number
+        of_noise = rest / self.noise.std  # its square may be too small for a number
         squares = np.add.reduceat(of_noise * of_noise, first).tolist()
         reference = value = self._rows.item(0, at)
         gain = float(self.noise_gains[0])

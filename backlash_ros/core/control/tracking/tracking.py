@@ -17,7 +17,6 @@ from backlash_ros.core.control.tracking.design import TrackingDesign, Weights, b
 from backlash_ros.core.control.tracking.feedback import StateFeedback, shrunk_crossings
 from backlash_ros.core.control.tracking.rest import OFF, Rest
 from backlash_ros.core.control.tracking.trajectory import IdealTrajectory
-from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.law import StateSource
 from backlash_ros.core.plant.backlash import Region
 from backlash_ros.core.plant.numerics import NoiseLevel
@@ -123,11 +122,23 @@ class Tracking(ControlStructure):
         y_m, y, estimate, source, crossing = inputs
         self.prepare()
         feedback, rest, references = self.feedback, self.rest, self.trajectory.references
-        first, x_cov = references.empty, source.x_cov
-        self._take_over(y, y_m, estimate, inverse)
+        first, x_cov, hand_over = references.empty, source.x_cov, self.hand_over
+        if first:
+            # What may be noise is no distance to go: a loop at rest stays at rest.
+            self.trajectory.begin(y_m if abs(y - y_m) <= OFF * self._noise_std else y)
+        elif hand_over.leading:
+            self.trajectory.lead_to(y_m)
+        hand_over.leading = False
         plan = self.trajectory.take(y_m)
+        follows = not (rest.mode.steps or inverse.taking_up)
+        if feedback.take(estimate, plan.u, first) and follows and hand_over.due is None:
+            hand_over.due = inverse.extreme  # that led to v with the estimate before
+        if hand_over.due is not None:
+            stands_for = inverse.resume(feedback.trust.slope, *feedback.trust.crossings)
+            if inverse.side is not Region.GAP:
+                hand_over.added += stands_for - hand_over.due
+            hand_over.due = None
         deviation = feedback.deviation(source.x_hat, plan.x)
-        feedback.begin(plan.u, estimate, first)
         turned = self.trajectory.turn(
             self._noise_std, feedback.gap_u, inverse.direction_band, crossing)
         correction, worth = feedback.u(
@@ -136,8 +147,8 @@ class Tracking(ControlStructure):
         u_d = plan.aim - correction
         if feedback.knows_noise:
             u_d = self._without_crossing(u_d, plan.aim - worth, noise, deviation, inverse)
-        added = self.hand_over.added
-        self.hand_over.added *= FADING
+        added = hand_over.added
+        hand_over.added *= FADING
         u_d += added
         pull, before = rest.pull_back(deviation, feedback.most), rest.mode
         spread = max(references.high, y_m) - min(references.low, y_m) - references.noise_spread
@@ -150,7 +161,7 @@ class Tracking(ControlStructure):
             rest.stay(inverse)
         side = self._side(turned, u_d, noise, inverse)
         # Whatever makes u_d: nothing leads it further from what the reference asks for.
-        reach = feedback.reach + (abs(added) if self.hand_over.widens else 0.0)
+        reach = feedback.reach + (abs(added) if hand_over.widens else 0.0)
         u_d = min(max(rest.target[0] if mode.steps else u_d, plan.u - reach), plan.u + reach)
         side_before, v_before, trust = inverse.side, inverse.v, feedback.trust
         if mode.steps:
@@ -176,26 +187,6 @@ class Tracking(ControlStructure):
             self.feedback.prepare(x_cov, self._noise_std, *self.trajectory.noise)
             if self.feedback.trust.full and self.trajectory.soften(self.feedback.gap_u):
                 self._change_trajectory(source)
-
-    def _take_over(
-        self, y: float, y_m: float, estimate: Estimate, inverse: BacklashInverse,
-    ) -> None:
-        """Go on with this estimate, and with v and references from whoever has made v so far."""
-        hand_over, feedback, trajectory = self.hand_over, self.feedback, self.trajectory
-        follows = not (self.rest.mode.steps or inverse.taking_up)
-        if feedback.take_estimate(estimate) and follows and hand_over.due is None:
-            hand_over.due = inverse.extreme  # that led to v with the estimate before
-        if hand_over.due is not None:
-            stands_for = inverse.resume(feedback.trust.slope, *feedback.trust.crossings)
-            if inverse.side is not Region.GAP:
-                hand_over.added += stands_for - hand_over.due
-            hand_over.due = None
-        if trajectory.references.empty:
-            # What may be noise is no distance to go: a loop at rest stays at rest.
-            trajectory.begin(y_m if abs(y - y_m) <= OFF * self._noise_std else y)
-        elif hand_over.leading:
-            trajectory.lead_to(y_m)
-        hand_over.leading = False
 
     def _without_crossing(
         self, wanted: float, worth: float, noise: float, deviation: Sequence[float],

@@ -41,7 +41,6 @@ class TrajectoryState:
 
     @property
     def u(self) -> float:
-        """u* of this sample."""
         return self.ahead[0]
 
     @property
@@ -78,7 +77,7 @@ class IdealTrajectory:
         """Ask for less where noise of references makes u* cross a gap of this u; say if so."""
         # What each plan makes of noise that is averaged over the widest parabola.
         of_noise = [plan.noise_gains.item(-1) for plan in self._design.plans]
-        now, noise_std = of_noise[self.softness], self.references.noise_std
+        now, noise_std = of_noise[self.softness], self.references.noise.std
         if gap_u == 0.0 or noise_std * now <= QUIET * gap_u:
             return False
         softer = next((i for i, gain in enumerate(of_noise) if noise_std * gain <= QUIET * gap_u),
@@ -102,7 +101,7 @@ class IdealTrajectory:
         z = np.linalg.matrix_power(plan.closed, steps) @ start + np.einsum(
             'kij,kj->i', powers(plan.closed, inputs, steps), pairs)
         state.x, state.q = z[:n].tolist(), float(z[n])
-        state.ahead = self._ahead(self.references.window, plan.references)
+        state.ahead = self._ahead(self.references.window)
 
     def begin(self, r: float) -> None:
         """Rest at y = r."""
@@ -117,7 +116,7 @@ class IdealTrajectory:
 
     def take(self, y_m: float) -> TrajectoryState:
         """Take in r(k + N), so that u* is known for this sample and those ahead."""
-        due, r = self._due or self._look_ahead(), float(y_m)
+        due, r = self._due or self._ahead(self.references.window[1:]), float(y_m)
         self.references.append(r)
         self.state.ahead = [u + gain * r for u, gain in zip(due, self._newest_gains, strict=True)]
         return self.state
@@ -165,7 +164,7 @@ class IdealTrajectory:
     def noise(self) -> tuple[Array, float]:
         """Covariance of x* for noise of 1 in references averaged as these are, and their noise."""
         by_width = np.abs(self._plan.noise_gains - self.references.u_noise_gain)
-        return self._plan.x_noise[int(by_width.argmin())], self.references.noise_std
+        return self._plan.x_noise[int(by_width.argmin())], self.references.noise.std
 
     def advance(self) -> None:
         """Go on to the next sample."""
@@ -180,17 +179,13 @@ class IdealTrajectory:
         self.references.settle()
         # The highest of many samples before a turn is some three deviations above.
         self.state.noise_band = 6.0 * self.references.u_noise_std
-        self._look_ahead()
+        self._due = self._ahead(self.references.window[1:])
 
-    def _look_ahead(self) -> list[float]:
-        self._due = self._ahead(self.references.window[1:], self._plan.references[:, :-1])
-        return self._due
-
-    def _ahead(self, references: Array, gains: Array) -> list[float]:
-        """u* from [x*; q*] and these references on."""
-        plan: list[float] = (
-            self._plan.states @ [*self.state.x, self.state.q] + gains @ references).tolist()
-        return plan
+    def _ahead(self, references: Array) -> list[float]:
+        """u* from [x*; q*] and these references on, as many as there are."""
+        gains = self._plan.references[:, :len(references)]
+        ahead = self._plan.states @ [*self.state.x, self.state.q] + gains @ references
+        return [float(u) for u in ahead]
 
 
 def _turn(
