@@ -10,7 +10,7 @@ from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.limits import Limits, check_last_commands
 from backlash_ros.core.control.paper_structure import PolePlacement, Proportional
 from backlash_ros.core.control.protocol import ControlStructure
-from backlash_ros.core.control.tracking.design import Weights, better_design, design, power_gain
+from backlash_ros.core.control.tracking.design import better_design, design, power_gain
 from backlash_ros.core.control.tracking.preview import preview_gains
 from backlash_ros.core.control.tracking.tracking import Tracking
 from backlash_ros.core.estimate import Bounds, Estimate
@@ -114,8 +114,7 @@ def build_structure(p: Parameters) -> ControlStructure:
         return Proportional()
     if p.structure == 'pole_placement':
         return PolePlacement(build_four_blocks(p))
-    weights = Weights(p.tracking.input_weight, p.tracking.integral_weight, p.tracking.preview)
-    return Tracking(design(build_state_model(p, commanded=True), weights), weights,
+    return Tracking(design(build_state_model(p, commanded=True), p.tracking), p.tracking,
                     p.inverse.caution, p.estimator.output_noise_std)
 
 

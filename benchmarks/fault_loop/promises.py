@@ -18,7 +18,7 @@ from backlash_ros.core.control.protocol import (
     LARGEST_IN_ACQUISITION,
     ControlInput,
 )
-from backlash_ros.core.control.tracking.design import Weights, feedback_around
+from backlash_ros.core.control.tracking.design import feedback_around
 from backlash_ros.core.control.tracking.rest import TOLERANCE
 from backlash_ros.core.control.tracking.tracking import FADING
 
@@ -99,7 +99,7 @@ class PromisedBound:
         if self._structure != 'tracking':
             return 0.0
         model, t = build_state_model(self._p), self._p.tracking
-        gains = (feedback_around(model, Weights(weight, t.integral_weight, t.preview), 1.0).state
+        gains = (feedback_around(model, t._replace(input_weight=weight), 1.0).state
                  for weight in self._weights)
         return TOLERANCE * self._noise * max(float(np.linalg.norm(gain)) for gain in gains)
 

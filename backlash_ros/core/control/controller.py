@@ -68,16 +68,14 @@ class AdaptiveController:
     ) -> ControlStep:
         """Learn from y(k), and return the command for sample k, within the limits.
 
-        lost: samples that never arrived since the last call; the plant went on with the last v
-        through them. Of each of the lost + 1 intervals since then, if it is known: applied, the v
-        that was really applied; commands, those that acted if it is not the last one; alternatives,
-        those that may have acted instead, nan where none may.
+        lost: samples that never arrived since the last call. Of each of the lost + 1 intervals,
+        if it is known: applied, the v that was; commands, those that acted if not the last one;
+        alternatives, those that may have acted instead, nan where none may.
         """
         if not all(map(plausible, (y, y_m, *applied, *commands))):
             raise ValueError(
                 f'y={y!r}, y_m={y_m!r}, applied={applied!r} and commands={commands!r} must be '
-                f'finite and no larger than {LARGEST_SIGNAL:g}'
-            )
+                f'finite and no larger than {LARGEST_SIGNAL:g}')
         serial, inverse = self._serial, self.inverse
         if self._interval is not None:
             self.lost_samples += lost
@@ -158,19 +156,14 @@ class AdaptiveController:
 
 @dataclass
 class Redesign:
-    """Has gains made for the better models of G that the estimator proposes, one at a time.
-
-    adopted: the learned G that is in use. considered: the proposal that was designed for last.
-    gains: for it, None for the present ones. failed: designs without a result. channel: where they
-    are made, from the first one on.
-    """
+    """Has gains made for the better models of G that the estimator proposes, one at a time."""
 
     executor: Executor
-    adopted: StateModel | None = None
-    considered: StateModel | None = None
-    gains: object | None = None
-    failed: int = 0
-    channel: Channel | None = None
+    adopted: StateModel | None = None  # the learned G that is in use
+    considered: StateModel | None = None  # the proposal that was designed for last
+    gains: object | None = None  # for it, None for the present ones
+    failed: int = 0  # designs without a result
+    channel: Channel | None = None  # where they are made, from the first one on
     _made: bool = False
     _waited: int = 0  # samples for which gains that are made could not take over
 
@@ -213,8 +206,7 @@ class SerialPlant(StateSource):
 
     Where v is the position of a motor encoder, the estimator learns G from that; the structure
     however commands the motor, and y answers as L(z) G(z) does. The gap and L change places in it,
-    as L takes less time than a motion does: the structure inverts the gap with the wind-up of the
-    motor added. observer: of x_hat of L G.
+    as L takes less time than a motion: it inverts the gap with the wind-up of the motor added.
     """
 
     def __init__(self, actuator: Actuator, model: StateModel, noise_std: float) -> None:
@@ -248,14 +240,11 @@ class SerialPlant(StateSource):
     def update(
         self, y: float | None, command: float, applied: float | None, estimate: Estimate,
     ) -> float:
-        """Take in y(k), None if it was lost, and the command of the interval before it.
-
-        Returns its v: as it was reported, else where the command takes the motor.
-        """
+        """Take in y(k), None if lost, and the command of the interval before it; return its v."""
         c_r, c_l, gap = estimate.c_r, estimate.c_l, estimate.c_r - estimate.c_l
         play = command * self.actuator.gain + c_r if isnan(self._play) else self._play
         position = self._motor.step(command, play - c_r, c_r, c_l)
-        v = position if applied is None else applied
+        v = position if applied is None else applied  # as it was reported
         self._play = clamp(v + 0.5 * gap if isnan(self._play) else self._play, v, v + gap)
         # Nothing is known of the gap before it was learned.
         seen = self.for_command(

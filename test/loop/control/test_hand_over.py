@@ -9,7 +9,7 @@ from strategies import GEAR, known_backlash
 from backlash_ros.core import Parameters, build_closed_loop, build_controller
 from backlash_ros.core.assembly import build_state_model, build_structure
 from backlash_ros.core.control.controller import AdaptiveController
-from backlash_ros.core.control.tracking.design import Weights, design
+from backlash_ros.core.control.tracking.design import design
 
 PARAMETERS = Parameters({
     **GEAR, **known_backlash(1.0, 0.5, -0.4), 'structure': 'tracking', 'amplitude': 1.0,
@@ -34,7 +34,7 @@ def with_other_weights(core: AdaptiveController) -> AdaptiveController:
 
 def with_other_gains(core: AdaptiveController) -> AdaptiveController:
     p = PARAMETERS
-    heavier = Weights(0.1, p.tracking.integral_weight, p.tracking.preview)
+    heavier = p.tracking._replace(input_weight=0.1)
     core.structure.adopt(design(build_state_model(p), heavier), core.estimator)
     return core
 

@@ -19,7 +19,6 @@ from backlash_ros.core.control.limits import Limits
 from backlash_ros.core.control.protocol import ControlStructure
 from backlash_ros.core.control.tracking.design import (
     TrackingDesign,
-    Weights,
     better_design,
     design,
     modulus_margin,
@@ -27,6 +26,7 @@ from backlash_ros.core.control.tracking.design import (
 from backlash_ros.core.control.tracking.tracking import Tracking
 from backlash_ros.core.law import Interval, Law, LawReport
 from backlash_ros.core.laws.fixed import FixedBacklash
+from backlash_ros.core.parameters.table import TrackingWeights
 from backlash_ros.core.plant.simulated_plant import SimulatedPlant
 from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
 from backlash_ros.core.simulation.closed_loop import ClosedLoop
@@ -115,7 +115,7 @@ def test_wrong_sign_is_told_until_there_is_an_estimate() -> None:
 Array = NDArray[np.float64]
 
 PERIOD, NOISE = 0.005, 1e-4
-WEIGHTS = Weights(1e-2, 0.0, 60)
+WEIGHTS = TrackingWeights(60, 1e-2, 0.0)
 TRUTH = Estimate(0.098, 0.55, -0.35, 0.0)
 
 
@@ -243,7 +243,7 @@ def test_a_loop_that_the_told_model_makes_unstable_is_rescued() -> None:
 
 
 def redesigned(
-    told: TransferFunction, better: TransferFunction, weights: Weights,
+    told: TransferFunction, better: TransferFunction, weights: TrackingWeights,
 ) -> TrackingDesign | None:
     return better_design(StateModel(better), weights, design(StateModel(told), weights))
 
@@ -252,7 +252,7 @@ def test_feedback_softens_until_the_loop_is_as_safe_as_the_one_it_replaces() -> 
     safe = redesigned(motor(), motor(0.5), WEIGHTS)
     assert safe.feedback.state == pytest.approx(safe.plans[0].gains.state)
     # With an integral the loop around a motor half as fast would keep less than around either.
-    weights = Weights(1e-2, 1e-3, 60)
+    weights = TrackingWeights(60, 1e-2, 1e-3)
     present = design(StateModel(motor()), weights)
     softer = redesigned(motor(), motor(0.5), weights)
     nominal = design(softer.model, weights)

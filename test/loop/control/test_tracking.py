@@ -9,13 +9,14 @@ from strategies import known_backlash
 
 from backlash_ros.core.assembly import build_controller, build_model, build_plant, build_reference
 from backlash_ros.core.control.inverse import BacklashInverse
-from backlash_ros.core.control.tracking.design import Weights, design, modulus_margin
+from backlash_ros.core.control.tracking.design import design, modulus_margin
 from backlash_ros.core.control.tracking.feedback import shrunk_crossings
 from backlash_ros.core.control.tracking.preview import PreviewGains, preview_gains
 from backlash_ros.core.control.tracking.rest import SHORT, Mode, Rest
 from backlash_ros.core.control.tracking.trajectory import TrajectoryState
 from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.parameters.table import TrackingWeights
 from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
 from backlash_ros.core.reference.signal import ReferenceSignal
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
@@ -163,7 +164,7 @@ def resting(std: float) -> tuple[Rest, BacklashInverse, Estimate]:
     inverse = BacklashInverse()
     inverse.step(1.0, 1.0, 1.0, -1.0)
     estimate = Estimate(1.0, 1.0, -1.0, 0.0, std, std, std, Status.TRACKING)
-    return Rest(design(model, Weights(1e-2, 0.0, 10))), inverse, estimate
+    return Rest(design(model, TrackingWeights(10, 1e-2, 0.0))), inverse, estimate
 
 
 @pytest.mark.parametrize('seed', [14, 319])

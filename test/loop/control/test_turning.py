@@ -8,10 +8,11 @@ from strategies import GEAR, known_backlash
 
 from backlash_ros.core import Parameters, build_closed_loop
 from backlash_ros.core.assembly import build_model
-from backlash_ros.core.control.tracking.design import Weights, design
+from backlash_ros.core.control.tracking.design import design
 from backlash_ros.core.control.tracking.feedback import TRUSTED_AFTER, StateFeedback, Trust
 from backlash_ros.core.control.tracking.tracking import Tracking
 from backlash_ros.core.control.tracking.trajectory import IdealTrajectory
+from backlash_ros.core.parameters.table import TrackingWeights
 from backlash_ros.core.plant.backlash import Region
 from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
 from backlash_ros.core.reference.signal import ReferenceSignal
@@ -119,7 +120,7 @@ def test_a_slow_crossing_begins_before_the_turn_and_ends_behind_it(take_up: floa
     assert slowly < at_once + 0.5 * 0.5 * (3.0 * PERIOD * samples) ** 2
 
 
-SLOW = design(StateModel(TransferFunction([0.1], [1.0, -1.9, 0.9])), Weights(1e-2, 0.0, 10))
+SLOW = design(StateModel(TransferFunction([0.1], [1.0, -1.9, 0.9])), TrackingWeights(10, 1e-2, 0.0))
 
 
 def test_no_noise_of_y_hides_a_turn_beside_which_the_gap_is_small() -> None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.control.tracking.preview import PreviewGains, averages, preview_gains
 from backlash_ros.core.parameters import ParameterError
+from backlash_ros.core.parameters.table import TrackingWeights
 from backlash_ros.core.plant.numerics import riccati
 from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction, powers
 
@@ -35,49 +36,29 @@ LOOK_AHEAD = 20  # samples, at most, for which u* is known ahead
 CONFIDENCES = (1e-4, 1e-1, 1e2, 1e5)
 
 
-class Weights(NamedTuple):
-    """input_weight: rho / |G|^2 at a twentieth of the sampling rate. preview: N [samples]."""
-
-    input_weight: float
-    integral_weight: float
-    preview: int
-
-
 class Plan(NamedTuple):
-    """One ideal trajectory.
-
-    closed: transition F of z = [x*; q*], (n + 1, n + 1). states (L, n + 1), references (L, N + 1):
-    u* of the next L samples, of z and the references. noise_gains: see ReferenceWindow. x_noise:
-    covariance (n, n) of x* for noise of 1 in references, for each of their averages.
-    """
+    """One ideal trajectory, with z = [x*; q*]."""
 
     gains: PreviewGains
-    closed: Array
-    states: Array
-    references: Array
-    noise_gains: Array
-    x_noise: tuple[Array, ...]
+    closed: Array  # transition F of z, shape (n + 1, n + 1)
+    states: Array  # u* of the next L samples, of z: shape (L, n + 1)
+    references: Array  # and of the references: shape (L, N + 1)
+    noise_gains: Array  # see ReferenceWindow
+    x_noise: tuple[Array, ...]  # covariances of x* for noise of 1 in references, for each average
 
 
 class TrackingDesign(NamedTuple):
-    """Gains of one model of G.
-
-    plans: ideal trajectories, each weighing u more than the one before, for references with noise.
-    feedback: of the deviations from them. schedule: gains (n,), that of full feedback first.
-    acquisition: gain (n,) while the backlash is unknown; None where no feedback is better. gentle:
-    gain (n,) at rest. push: |x| after HORIZON samples of u = 1. push_ahead: |y| after LOOK_AHEAD.
-    holding: see `_holding`, for each of the schedule.
-    """
+    """Gains of one model of G, shape (n,) where they are of x."""
 
     model: StateModel
-    plans: tuple[Plan, ...]
-    feedback: PreviewGains
-    schedule: tuple[Gain, ...]
-    acquisition: Gain | None
-    gentle: Gain
-    push: float
-    push_ahead: float
-    holding: list[tuple[Array, Array]]
+    plans: tuple[Plan, ...]  # each weighs u more than the one before, for references with noise
+    feedback: PreviewGains  # of the deviations from them
+    schedule: tuple[Gain, ...]  # that of full feedback first
+    acquisition: Gain | None  # while the backlash is unknown; None where no feedback is better
+    gentle: Gain  # at rest
+    push: float  # |x| after HORIZON samples of u = 1
+    push_ahead: float  # |y| after LOOK_AHEAD
+    holding: list[tuple[Array, Array]]  # see _holding, for each of the schedule
 
     def variances(self, x_cov: Array) -> Array:
         """Of K x for every gain of the schedule, and of |x| at last."""
@@ -85,7 +66,7 @@ class TrackingDesign(NamedTuple):
         return np.append(((gains @ x_cov) * gains).sum(axis=1), x_cov.trace())
 
 
-def design(model: StateModel, weights: Weights, weight_factor: float = 1.0) -> TrackingDesign:
+def design(model: StateModel, weights: TrackingWeights, factor: float = 1.0) -> TrackingDesign:
     """The gains for a model of G; raises ParameterError where there are none."""
     rest_bandwidth = 1.0 / 80.0  # rad per sample, up to which y is corrected at rest
     # A slope, in first guesses. Plants that bear less are led astray by any feedback that would
@@ -95,8 +76,8 @@ def design(model: StateModel, weights: Weights, weight_factor: float = 1.0) -> T
     plans = tuple(
         _plan(model, preview_gains(model, more * rho, weights.integral_weight, weights.preview))
         for more in SOFTER)
-    feedback = feedback_around(model, weights, weight_factor)
-    softer = [preview_gains(model, max(more, weight_factor) * rho) for more in SCHEDULE[1:]]
+    feedback = feedback_around(model, weights, factor)
+    softer = [preview_gains(model, max(more, factor) * rho) for more in SCHEDULE[1:]]
     schedule = feedback.state.tolist(), *(gains.state.tolist() for gains in softer)
     bears = modulus_margin(model, model, softer[SOFTEST - 1], wrong_slope) > 0.0
     # With |G|^2 at a frequency as weight of u^2, feedback acts up to about that frequency.
@@ -109,7 +90,7 @@ def design(model: StateModel, weights: Weights, weight_factor: float = 1.0) -> T
 
 
 def better_design(
-    model: StateModel, weights: Weights, present: TrackingDesign,
+    model: StateModel, weights: TrackingWeights, present: TrackingDesign,
 ) -> TrackingDesign | None:
     """Return the design for a better model of G, None where it is no safe replacement."""
     # The modulus margin that is safe in any case, without a sensitivity above 2, or else that of
@@ -117,22 +98,22 @@ def better_design(
     # as far as this takes and no further: the loop is the measure for the next G.
     needed = 0.5
     try:
-        for weight_factor in SAFER:
-            reached = modulus_margin(model, model, feedback_around(model, weights, weight_factor))
-            if reached < needed and weight_factor == SAFER[0]:
+        for factor in SAFER:
+            reached = modulus_margin(model, model, feedback_around(model, weights, factor))
+            if reached < needed and factor == SAFER[0]:
                 needed = min(needed, *(modulus_margin(plant, present.model, present.feedback)
                                        for plant in (present.model, model)))
             if 0.0 < reached >= needed:
-                return design(model, weights, weight_factor)
+                return design(model, weights, factor)
     except ParameterError:
         pass
     return None
 
 
-def feedback_around(model: StateModel, weights: Weights, weight_factor: float) -> PreviewGains:
-    """Of deviations from the trajectory, as if the input weighed `weight_factor` times as much."""
+def feedback_around(model: StateModel, weights: TrackingWeights, factor: float) -> PreviewGains:
+    """Of deviations from the trajectory, as if the input weighed so many times as much."""
     rho = weights.input_weight * power_gain(model.transfer_function, np.pi / 10.0)
-    return preview_gains(model, weight_factor * rho, weights.integral_weight)
+    return preview_gains(model, factor * rho, weights.integral_weight)
 
 
 def power_gain(model: TransferFunction, frequency: float) -> float:
@@ -200,11 +181,9 @@ def _plan(model: StateModel, gains: PreviewGains) -> Plan:
 def modulus_margin(
     plant: StateModel, model: StateModel, gains: PreviewGains, factor: float = 1.0,
 ) -> float:
-    """min |1 + L| of the open loop L of feedback around `model` and a plant; 0 if it is unstable.
-
-    For the worst of observers that do not know that u acts `factor` times as strongly. The gap
-    itself is left out: it limits what u can do wrong, but not for ever.
-    """
+    """min |1 + L| of the open loop L of feedback around `model` and a plant; 0 if unstable."""
+    # For the worst of observers that do not know that u acts `factor` times as strongly. The gap
+    # itself is left out: it limits what u can do wrong, but not for ever.
     n, least = plant.order, inf
     z = np.exp(1j * np.geomspace(1e-3, np.pi, 120))
     at, response = z[:, None, None], plant.transfer_function.response(z)

@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.protocol import Command, ControlInput, ControlStructure
-from backlash_ros.core.control.tracking.design import TrackingDesign, Weights, better_design, design
+from backlash_ros.core.control.tracking.design import TrackingDesign, better_design, design
 from backlash_ros.core.control.tracking.feedback import StateFeedback, shrunk_crossings
 from backlash_ros.core.control.tracking.rest import OFF, Rest
 from backlash_ros.core.control.tracking.trajectory import IdealTrajectory
 from backlash_ros.core.law import StateSource
+from backlash_ros.core.parameters.table import TrackingWeights
 from backlash_ros.core.plant.backlash import Region
 from backlash_ros.core.plant.numerics import NoiseLevel
 from backlash_ros.core.plant.transfer_function import StateModel
@@ -45,7 +46,8 @@ class Tracking(ControlStructure):
     """
 
     def __init__(
-        self, beginning: TrackingDesign, weights: Weights, shrinkage: float, noise_std: float = 0.0,
+        self, beginning: TrackingDesign, weights: TrackingWeights, shrinkage: float,
+        noise_std: float = 0.0,
     ) -> None:
         self.delay = weights.preview
         self._weights, self._design = weights, beginning
