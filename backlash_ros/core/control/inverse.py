@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from math import inf, nan
 
-from backlash_ros.core.parameters import ParameterError
 from backlash_ros.core.plant.backlash import Region, clamp
 
 
@@ -18,10 +17,6 @@ class BacklashInverse:
     """
 
     def __init__(self, direction_band: float = 0.0, take_up: float = inf) -> None:
-        if not direction_band >= 0.0:
-            raise ParameterError('inverse.direction_band', direction_band, 'must be >= 0')
-        if not take_up > 0.0:
-            raise ParameterError('inverse.take_up_rate', take_up, 'must be > 0')
         self.direction_band, self.take_up = direction_band, take_up
         # Line in use, GAP until u_d moves for the first time, and furthest u_d on it.
         self.v, self.side, self.extreme = 0.0, Region.GAP, 0.0
@@ -42,8 +37,7 @@ class BacklashInverse:
         self, u_d: float, m: float, c_r: float, c_l: float, band: float | None = None,
     ) -> float:
         """Return v(t) for u_d(t) and the parameters in use (2.3); band: not direction_band."""
-        if band is None:
-            band = self.direction_band
+        band = self.direction_band if band is None else band
         side = self.direction(u_d, band)
         if self.taking_up and self.side is not Region.GAP:
             # u is held until v arrives: it turns only where u_d lies on the other side of that.

@@ -49,10 +49,7 @@ class Limits:
         return min(max(0.0, self.low), self.high)
 
     def go_on_from(self, told: float, known: float | None) -> float:
-        """The v from which commands go on where others tell that it acts.
-
-        It is not out of the bounds, or no further than known: the v that acted before they told.
-        """
+        """The v to go on from where others tell it: in the bounds, or no further out than known."""
         low, high = (self.low, self.high) if known is None else (
             min(self.low, known), max(self.high, known))
         return min(max(told, low), high)
