@@ -52,13 +52,7 @@ class Topic(NamedTuple):
     definition: str
 
 
-class BagMessage(NamedTuple):
-    """A recorded message in CDR."""
-
-    topic: Topic
-    stamp_ns: int
-    data: bytes
-
+BagMessage = tuple[Topic, int, bytes]  # with its stamp [ns], in CDR
 
 class Bag:
     """An open bag. After a RecordingError it is closed, and holds what was flushed before.
@@ -240,7 +234,7 @@ def _read_mcap(file: Path, wanted: Callable[[Topic], bool]) -> Iterator[BagMessa
                 if wanted(topic):
                     topics[record.id] = topic
             elif isinstance(record, mcap.records.Message) and record.channel_id in topics:
-                yield BagMessage(topics[record.channel_id], record.log_time, record.data)
+                yield topics[record.channel_id], record.log_time, record.data
 
 
 def _read_sqlite(file: Path, wanted: Callable[[Topic], bool]) -> Iterator[BagMessage]:
@@ -258,7 +252,7 @@ def _read_sqlite(file: Path, wanted: Callable[[Topic], bool]) -> Iterator[BagMes
         for number, stamp_ns, data in database.execute(
                 'SELECT topic_id, timestamp, data FROM messages NOT INDEXED '
                 f'WHERE topic_id IN ({", ".join(map(str, chosen))}) ORDER BY id'):
-            yield BagMessage(topics[number], int(stamp_ns), bytes(data))
+            yield topics[number], int(stamp_ns), bytes(data)
         if not database.execute('SELECT count(*) FROM metadata').fetchone()[0]:
             raise BagError(f'{file}: was never closed')
 

@@ -58,7 +58,7 @@ class Graph:
 
 @dataclass
 class Heard:
-    """Messages of the three topics, and when listening ended [ns]."""
+    """Messages of the three topics, which grow, and when listening ended [ns]."""
 
     outputs: list[Message] = field(default_factory=list)
     controls: list[Message] = field(default_factory=list)
@@ -67,7 +67,6 @@ class Heard:
 
     @property
     def by_topic(self) -> dict[str, list[Message]]:
-        """The lists, which grow, by their topics."""
         return {'plant_output': self.outputs, 'control': self.controls,
                 'applied_control': self.applied}
 
@@ -98,8 +97,7 @@ class Sampling(NamedTuple):
         if v is None:
             return None
         y = np.full(len(v), np.nan)
-        y[self.numbers] = [value if plausible(value) else np.nan
-                           for value in self.outputs['value'].tolist()]
+        y[self.numbers] = [value if plausible(value) else np.nan for value in self.outputs['value']]
         known = int(np.argmax(np.isfinite(v)))
         return v[known:], y[known:]
 

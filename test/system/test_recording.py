@@ -49,7 +49,7 @@ def count_signals(bag: Path) -> int:
         messages = BagReader(bag).messages()
     except BagError:  # not there yet
         return 0
-    return sum(message.topic.name == f'/{topics.SIGNALS}' for message in messages)
+    return sum(topic.name == f'/{topics.SIGNALS}' for topic, _, _ in messages)
 
 
 def go_on(probe: Probe, heard: list[Float64MultiArray], further: int) -> None:
@@ -130,8 +130,8 @@ def test_a_bag_is_read_while_it_is_recorded_and_complete_after_a_signal_amid_a_f
         counts = node.events('closed')[0]['messages']
         assert all(nodes[name].stop() == 0 for name in ('plant', 'reference', 'controller'))
     assert damage(bag) == ''
-    values = [message.data for message in BagReader(bag).messages()
-              if message.topic.name == f'/{topics.REFERENCE}']
+    values = [data for topic, _, data in BagReader(bag).messages()
+              if topic.name == f'/{topics.REFERENCE}']
     assert len(values) == counts[f'/{topics.REFERENCE}'] > 100
 
 

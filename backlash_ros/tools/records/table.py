@@ -30,8 +30,7 @@ MOST_BROKEN = 0.1  # share of the lines that may be broken, and of the cells tha
 
 
 class Table(NamedTuple):
-    """Cells of a file by the names in its head, or '1', '2', …; whether the comma is the decimal
-    sign."""
+    """Cells by the names in the head, or '1', '2', …; whether the comma is the decimal sign."""
 
     columns: Mapping[str, Sequence[str]]
     comma: bool = False
@@ -181,9 +180,15 @@ def _from_text(text: str) -> Table:
     at = rows.index(head) if head in rows else -1
     if at > 0 and rows[at - 1] in heads and _are_units(head):
         head, units = rows[at - 1], head
-    names = _told_apart(head, units, count)
+    empty = [''] * count
+    names = [cell or str(k + 1) for k, cell in enumerate([*head, *empty][:count])]
+    # A second one of a name with its number.
+    names = [f'{name} ({names[:k].count(name) + 1})' if name in names[:k] else name
+             for k, name in enumerate(names)]
+    names = [f'{name} [{unit.strip("[]() ")}]' if unit else name
+             for name, unit in zip(names, [*units, *empty], strict=False)]
     below = [k for k in range(at + 1, len(rows)) if rows[k] not in (head, units)]
-    body = [[*rows[k], *[''] * (count - len(rows[k]))][:count] for k in below if data[k]]
+    body = [[*rows[k], *empty][:count] for k in below if data[k]]
     skipped = len(below) - len(body)
     if skipped > max(MOST_BROKEN * len(body), 3.0):
         raise RecordError(f'{skipped} of {skipped + len(body)} lines are no rows of its table: '
@@ -232,15 +237,6 @@ def _are_units(row: Sequence[str]) -> bool:
     return all(len(cell) <= 9 for cell in bare) and (
         len({*bare}) < len(bare) or any(cell in UNITS_S for cell in bare)
         or all(cell[:1] in '[(' for cell in row))
-
-
-def _told_apart(head: Sequence[str], units: Sequence[str], count: int) -> list[str]:
-    """Names of all columns: numbers for those without, a second one of a name with its number."""
-    names = [(head[k] if k < len(head) else '') or str(k + 1) for k in range(count)]
-    again = [names[:k].count(name) + 1 for k, name in enumerate(names)]
-    names = [f'{name} ({n})' if n > 1 else name for name, n in zip(names, again, strict=True)]
-    return [f'{name} [{units[k].strip("[]() ")}]' if k < len(units) and units[k] else name
-            for k, name in enumerate(names)]
 
 
 def _from_parquet(path: Path) -> Table:
