@@ -20,11 +20,9 @@ from backlash_ros.core.loop.command_history import REPORTED, report_use, v_of_in
 from backlash_ros.core.loop.diagnosis import SKEW, TROUBLE
 from backlash_ros.core.loop.sample_counter import UNNUMBERED, SampleCounter
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.plant.transfer_function import TransferFunction
+from backlash_ros.core.plant.transfer_function import Array, TransferFunction
 from backlash_ros.core.record_fit import fit_record
 from backlash_ros.core.records.readings import frequencies_of, own_readings
-
-Array = NDArray[np.float64]
 
 FLOAT64 = 'std_msgs/msg/Float64'
 FITS, WRONG, UNKNOWN = '✓', '✗', '–'

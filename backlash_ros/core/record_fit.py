@@ -7,17 +7,14 @@ from math import inf, nan
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Bounds
 from backlash_ros.core.estimation import explanations, settings
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.posterior import WindowFit
-from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
+from backlash_ros.core.plant.transfer_function import Array, StateModel, TransferFunction
 from backlash_ros.core.records.readings import check_record, outliers
 from backlash_ros.core.simulation.run_record import turns
-
-Array = NDArray[np.float64]
 
 
 class RecordFit(NamedTuple):

@@ -5,7 +5,6 @@ from __future__ import annotations
 from math import hypot, inf
 
 import numpy as np
-from numpy.typing import NDArray
 
 from backlash_ros.core.control import protocol
 from backlash_ros.core.control.inverse import BacklashInverse
@@ -13,8 +12,7 @@ from backlash_ros.core.control.protocol import Command, ControlInput, ControlStr
 from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.plant.backlash import Region
 from backlash_ros.core.plant.numerics import FourBlocks
-
-Array = NDArray[np.float64]
+from backlash_ros.core.plant.transfer_function import Array
 
 # (m - f) divides: f beyond this share of m would multiply every error in m by more than five.
 LARGEST_F_OVER_M = 0.8

@@ -20,9 +20,7 @@ from backlash_ros.core.identification.identification import Identification
 from backlash_ros.core.parameters import ParameterError
 from backlash_ros.core.plant.actuator import Actuator
 from backlash_ros.core.plant.numerics import lfilter
-from backlash_ros.core.plant.transfer_function import TransferFunction
-
-Array = NDArray[np.float64]
+from backlash_ros.core.plant.transfer_function import Array, TransferFunction
 
 
 def with_actuator(found: Identification, commands: Array) -> Identification:

@@ -13,7 +13,6 @@ from math import inf, nan, sqrt
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.fit import FIRST_STEPS
 from backlash_ros.core.identification import model as models
@@ -23,9 +22,8 @@ from backlash_ros.core.identification.not_play import Observed, limited, rate_li
 from backlash_ros.core.identification.structure_search import Options, StructureSearch, Units
 from backlash_ros.core.identification.verdict import CERTAIN, Findings, Verdict, judge
 from backlash_ros.core.plant.actuator import Actuator
+from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.records.readings import busiest, check_record, frequencies_of, quantum
-
-Array = NDArray[np.float64]
 
 
 class Details(NamedTuple):

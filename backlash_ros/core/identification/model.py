@@ -28,8 +28,7 @@ from backlash_ros.core.estimation.plant_family import delayed, padded, state_col
 from backlash_ros.core.estimation.posterior import Prior, WindowFit
 from backlash_ros.core.plant.backlash import play
 from backlash_ros.core.plant.numerics import lfilter
-
-Array = NDArray[np.float64]
+from backlash_ros.core.plant.transfer_function import Array
 
 VAGUE = 1e3  # prior deviation of a coefficient, in scaled units
 TINY = float(np.finfo(float).tiny)

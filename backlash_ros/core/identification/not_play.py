@@ -14,12 +14,11 @@ from math import copysign
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from backlash_ros.core.plant.backlash import play
 from backlash_ros.core.plant.numerics import lfilter
+from backlash_ros.core.plant.transfer_function import Array
 
-Array = NDArray[np.float64]
 At = tuple[float, ...]  # parameters of a nonlinearity
 
 

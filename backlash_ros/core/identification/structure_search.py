@@ -17,7 +17,6 @@ from math import exp, inf, log, nan, sqrt
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.fit import FEW_STEPS, FIRST_STEPS
 from backlash_ros.core.estimation.posterior import step_of
@@ -36,9 +35,8 @@ from backlash_ros.core.identification.model import (
 from backlash_ros.core.identification.not_play import Observed, what_it_is
 from backlash_ros.core.identification.verdict import ANOTHER
 from backlash_ros.core.plant.numerics import lfilter
+from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.records.readings import noise_of, outliers, quantum
-
-Array = NDArray[np.float64]
 
 EARLY, LONGEST_DELAY = (0, 1, 2, 3), 40  # delays that are compared first, and the longest
 GENERAL_POLES = 3  # of the G with which the gap is searched first; it has a tap for each delay

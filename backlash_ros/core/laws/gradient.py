@@ -20,14 +20,12 @@ Nonlinearities, Wiley 1996.
 from math import nan
 
 import numpy as np
-from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Bounds, Estimate, Status
 from backlash_ros.core.law import Interval, Law
 from backlash_ros.core.laws.input_reconstruction import LEAST_SQUARE, MEMORY, Agreement
 from backlash_ros.core.plant.numerics import FourBlocks
-
-Array = NDArray[np.float64]
+from backlash_ros.core.plant.transfer_function import Array
 
 
 class GradientEstimator(Law):

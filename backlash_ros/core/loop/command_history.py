@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.loop.loop_statistics import LoopStatistics
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.plant.transfer_function import Array
 
-Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]  # [ns], of one clock
 
 LOOKS = 10  # that tell the origin of reports, after which it counts as settled

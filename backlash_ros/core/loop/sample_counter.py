@@ -6,9 +6,6 @@ from math import isfinite, nan, sqrt
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
 
 # Share by which a period has to be off to be taken for another one than that of the model.
 OTHER_PERIOD = 0.003

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.parameters import ParameterError
+from backlash_ros.core.plant.transfer_function import Array
 
-Array = NDArray[np.float64]
 Sides = NDArray[np.int8]
 
 

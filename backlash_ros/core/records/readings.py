@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.settings import GATE, OUTLIER_SHARE
+from backlash_ros.core.plant.transfer_function import Array
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 NEARLY_ALL = 0.9  # share of what speaks for an explanation

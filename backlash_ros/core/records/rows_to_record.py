@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from backlash_ros.core.control.limits import LARGEST_SIGNAL
 from backlash_ros.core.loop.command_history import v_of_intervals
 from backlash_ros.core.loop.sample_counter import CLOCK_SLACK, JITTER
+from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.records import readings, stamps
 from backlash_ros.core.records.record import Record, RecordError, seconds
 
-Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
 BREAK = 3.0  # periods from row to row that are a gap

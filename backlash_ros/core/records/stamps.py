@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.records.record import RecordError, seconds
-
-Array = NDArray[np.float64]
 
 
 def in_seconds(

@@ -5,16 +5,14 @@ from dataclasses import dataclass
 from math import nan
 
 import numpy as np
-from numpy.typing import NDArray
 
 from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.estimates_file import was_given
 from backlash_ros.core.law import Law
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.scenario import build_model
-
-Array = NDArray[np.float64]
 
 COLUMNS = (
     't', 'y_m', 'y', 'u_d', 'v', 'u', 'm', 'c_r', 'c_l', 'f', 'std_m', 'std_c_r', 'std_c_l',

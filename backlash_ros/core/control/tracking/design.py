@@ -9,15 +9,13 @@ from operator import mul
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from backlash_ros.core.control.tracking.preview import PreviewGains, averages, preview_gains
 from backlash_ros.core.parameters import ParameterError
 from backlash_ros.core.parameters.table import TrackingWeights
 from backlash_ros.core.plant.numerics import riccati
-from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction, powers
+from backlash_ros.core.plant.transfer_function import Array, StateModel, TransferFunction, powers
 
-Array = NDArray[np.float64]
 Gain = list[float]
 
 # Times the input weight of feedback: the softer gains are for noise, and up to SOFTEST for the time

@@ -14,15 +14,13 @@ from math import hypot, inf, isnan, nan
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from backlash_ros.core.control.protocol import LARGEST_FEEDBACK, LARGEST_IN_ACQUISITION
 from backlash_ros.core.control.tracking.design import SOFTEST, TrackingDesign, dot
 from backlash_ros.core.control.tracking.rest import ARRIVED, ASTRAY, CLOSE, TOLERANCE, UNCERTAIN
 from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.plant.backlash import Region
-
-Array = NDArray[np.float64]
+from backlash_ros.core.plant.transfer_function import Array
 
 TRUSTED_AFTER = 40  # samples for which an estimate has to hold before it gets full feedback
 # An estimate this sharp, in relative deviations of slope and gap, counts so many times per sample.

@@ -17,13 +17,10 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from backlash_ros.core.parameters import ParameterError
 from backlash_ros.core.plant.numerics import NoiseLevel, riccati
-from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
-
-Array = NDArray[np.float64]
+from backlash_ros.core.plant.transfer_function import Array, StateModel, TransferFunction
 
 
 class PreviewGains(NamedTuple):

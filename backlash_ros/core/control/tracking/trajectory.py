@@ -12,14 +12,11 @@ from dataclasses import dataclass, field
 from math import ceil, dist, isnan, nan
 
 import numpy as np
-from numpy.typing import NDArray
 
 from backlash_ros.core.control.tracking.design import TrackingDesign, dot
 from backlash_ros.core.control.tracking.preview import ReferenceWindow
 from backlash_ros.core.plant.backlash import Region
-from backlash_ros.core.plant.transfer_function import powers
-
-Array = NDArray[np.float64]
+from backlash_ros.core.plant.transfer_function import Array, powers
 
 QUIET = 0.02  # share of the u that the gap takes, by which noise of the references may move u*
 
