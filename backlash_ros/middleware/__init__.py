@@ -1,10 +1,8 @@
 """Whether ROS 2 is there, and how its middleware carries messages on this machine alone.
 
-By itself Fast DDS 2.14 takes shared memory, which a process that is killed may leave in disorder:
-others do not hear its successor, or end with a segmentation fault. What a reader misses it sends
-again after 3 s only. With loopback.xml messages go by UDP over the loopback device, which a killed
-process cannot damage, and are soon repeated. With ROS_STATIC_PEERS, where other machines take
-part, network.xml has lost messages repeated within milliseconds.
+By itself Fast DDS 2.14 takes shared memory, which a process that is killed may leave in disorder,
+and repeats lost messages after 3 s only. With loopback.xml they go by UDP over the loopback device;
+there and in network.xml, where ROS_STATIC_PEERS take part, they are soon repeated.
 """
 
 from __future__ import annotations

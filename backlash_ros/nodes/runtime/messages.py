@@ -1,9 +1,8 @@
 """Messages that are made once and published often, and those of every sample as bytes.
 
-rclpy takes and publishes these bytes as they are, in half the time of a std_msgs/Float64, and in a
-tenth of that of a sensor_msgs/JointState of six joints. Four bytes name the encoding, the second
-one odd where the lowest byte comes first. What follows is aligned to its size (CDR: DDS
-Interoperability Wire Protocol, 10.2).
+rclpy takes and publishes these in half the time of a std_msgs/Float64, in a tenth of that of a
+sensor_msgs/JointState of six joints. Four bytes name the encoding, the second one odd where the
+lowest byte comes first. What follows is aligned to its size (CDR: DDS Interoperability, 10.2).
 """
 
 from __future__ import annotations

@@ -107,10 +107,7 @@ class ProcessNode(ParameterNode):
         self, condition: Callable[[], bool], action: Callable[[], object], awaited: str,
         starts: bool = False,
     ) -> None:
-        """Call action as soon as condition holds. starts: the node is ready then.
-
-        awaited: what the log says is missing.
-        """
+        """Call action when condition holds; awaited: for the log; starts: the node is ready."""
         remind = time.monotonic() + 5.0
 
         def look() -> None:
@@ -131,10 +128,7 @@ class ProcessNode(ParameterNode):
 def run(
     executable: str, make_node: Callable[[], ProcessNode], args: list[str] | None = None,
 ) -> int:
-    """Run a node until its work ends, by itself or by SIGINT or SIGTERM; return the exit code.
-
-    That of the node, or 2 for bad input, told in one line on stderr. Any other exception passes.
-    """
+    """Run a node until its work or a signal ends it; return its exit code, or 2 for bad input."""
     arguments = sys.argv[1:] if args is None else args
     signals: list[int] = []
     # The handlers of rclpy would raise KeyboardInterrupt anywhere and shut ROS down beneath a node
