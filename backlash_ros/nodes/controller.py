@@ -46,8 +46,10 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
     each of them: a message has y of all, and one with v of all answers it.
     """
 
+    reconfigurable = True
+
     def __init__(self) -> None:
-        ProcessNode.__init__(self, CONTROLLER, reconfigurable=True)
+        ProcessNode.__init__(self, CONTROLLER)
         LifecycleNodeMixin.__init__(self)
         refuse_unfit_transitions(self)
         p = self.settings

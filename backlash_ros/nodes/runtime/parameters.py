@@ -30,6 +30,7 @@ class ParameterNode(Node):
     """A node with a complete, checked set of parameters, of which all or none change."""
 
     settings: Parameters
+    reconfigurable = False  # whether all but the fixed ones may change while it is unconfigured
 
     def is_configured(self) -> bool:
         """Whether only live parameters may change now, of those that are not read-only."""
@@ -41,8 +42,8 @@ class ParameterNode(Node):
     def take_up(self, before: Parameters) -> None:
         """Use the settings, which have changed."""
 
-    def declare_settings(self, executable: str, reconfigurable: bool) -> None:
-        """Declare what the table says of this executable; reconfigurable: while unconfigured."""
+    def declare_settings(self, executable: str) -> None:
+        """Declare what the table says of this executable; raises ParameterError."""
         # rclpy has no other way to ask for all names that were given; two are declared by itself.
         given = {
             name: _given_value(parameter)
@@ -74,7 +75,7 @@ class ParameterNode(Node):
                 description=entry.description + (f' [{entry.unit}]' if entry.unit else ''),
                 additional_constraints='one of ' + ', '.join(entry.choices) if entry.choices
                 else entry.rules,
-                read_only=entry.change not in ('live', *['unconfigured'] * reconfigurable),
+                read_only=entry.change not in ('live', *['unconfigured'] * self.reconfigurable),
             ))
 
     def set_parameters_atomically(self, parameter_list: list[RosParameter]) -> SetParametersResult:

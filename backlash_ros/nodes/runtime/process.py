@@ -64,13 +64,11 @@ class ProcessNode(ParameterNode):
     others and is found, on the steady clock [s]. signals: the SIGINT and SIGTERM that have come.
     """
 
-    def __init__(
-        self, executable: str, parameters_of: str = '', reconfigurable: bool = False,
-    ) -> None:
+    def __init__(self, executable: str, parameters_of: str = '') -> None:
         super().__init__(executable)
         self.begun_at = time.monotonic()
         self.log = Node.get_logger(self)
-        self.declare_settings(parameters_of or executable, reconfigurable)
+        self.declare_settings(parameters_of or executable)
         self.signals: list[int] = []
         self.exit_code, self.started = DONE, False
 
@@ -83,9 +81,8 @@ class ProcessNode(ParameterNode):
         return self.create_timer(period_s, action, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def listen(
-        self, message_type: type[Any], topic: str,
-        callback: Callable[[Any, dict[str, Any]], None], qos: QoSProfile | int, raw: bool = False,
-        polled: bool = False,
+        self, message_type: type[Any], topic: str, callback: Callable[[Any, Any], None],
+        qos: QoSProfile | int, raw: bool = False, polled: bool = False,
     ) -> Subscription:
         """Subscribe with times and number of the message; polled: called by serve_polled alone."""
         # rclpy takes such callbacks but does not say so in its types.
