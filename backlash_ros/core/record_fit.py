@@ -81,8 +81,8 @@ def fit_record(
     if few or np.ptp(v) == 0.0:
         why = f'too few samples: {len(after)} after the longest delay' if few else 'v stood still'
         return RecordFit(nominal, nominal, (why,))
-    setup = explanations.Setup(PlantFamily(nominal, uncertainty), noise_std, bounds or Bounds(),
-                               inf, float(np.ptp(v)), 0.0, np.zeros(3))
+    setup = explanations.Setup(PlantFamily(nominal, uncertainty), max(noise_std, 1e-12),
+                               bounds or Bounds(), inf, float(np.ptp(v)), 0.0, np.zeros(3))
     fits = [_fitted(setup, v[longest - delay:len(v) - 1 - delay], after, bounds)._replace(
         delay=delay) for delay in delays]
     evidence = {each.delay: each.fit.evidence if each.fit else -inf for each in fits}

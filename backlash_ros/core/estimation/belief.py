@@ -40,13 +40,6 @@ class Kept(NamedTuple):
     swapped: frozenset[int] = frozenset()  # of samples over which the other command acted
 
 
-class Look(NamedTuple):
-    """The next time to look for other gaps: at this number of samples, or this deviation of one."""
-
-    at: int = 0
-    gap_std: float = 0.0
-
-
 class Trial(NamedTuple):
     """Samples that a fit must predict before it is published, and has; its noise when adopted."""
 
@@ -63,7 +56,7 @@ class Belief(NamedTuple):
     doubt_from: int | None = None  # sample from which on the fit is contradicted
     end: int = 0
     next_at: int = settings.FIRST_FIT  # number of samples at which to look again
-    thorough: Look = Look()  # for other gaps too
+    thorough: tuple[int, float] = 0, 0.0  # the same for other gaps, or deviation of this one
     kept: Kept = Kept()
     trial: Trial = Trial()
     published: Known | None = None
@@ -93,10 +86,9 @@ def published(setup: Setup, belief: Belief, fit: WindowFit) -> Belief:
     if belief.trial.predicted < belief.trial.must:
         return belief
     cov = fit.crossings_cov + np.diag(setup.drift**2 * (belief.end - belief.kept.first) / 3.0)
-    walked = (fit.walk_std / fit.m) ** 2 * (belief.next_at - belief.end)
-    cov += walked * np.outer([0.0, 1.0, 1.0], [0.0, 1.0, 1.0])
-    return belief._replace(
-        published=Known(fit.crossings, cov), reason=Status.TRACKING, coasts=False)
+    cov[1:, 1:] += (fit.walk_std / fit.m) ** 2 * (belief.next_at - belief.end)
+    known = Known(fit.crossings, cov)
+    return belief._replace(published=known, reason=Status.TRACKING, coasts=False)
 
 
 def _beside_inherited(setup: Setup, belief: Belief, fit: WindowFit, known: Known) -> Belief:
@@ -127,18 +119,17 @@ def _beside_inherited(setup: Setup, belief: Belief, fit: WindowFit, known: Known
         joined = known  # what explains y no better is no reason to move
     if not setup.are_precise(*joined, fit.systematic):
         return belief._replace(reason=Status.ACQUIRING)
-    unexplained = setup.moves_unexplained(fit)
-    return belief._replace(published=joined,
-                   reason=Status.INCONSISTENT if unexplained else Status.TRACKING)
+    reason = Status.INCONSISTENT if setup.moves_unexplained(fit) else Status.TRACKING
+    return belief._replace(published=joined, reason=reason)
 
 
 def shortened(
     setup: Setup, record: Window, problem: Problem, belief: Belief, fit: WindowFit,
 ) -> tuple[Belief, WindowFit]:
     """Let the oldest samples go, but for what they say of theta, once the others hold enough."""
-    count, kept, p = len(record.v), belief.kept, problem.at(fit).p
-    turns, drift = reversals(engaged(record.v, p, fit.gap)), setup.drift**2 * count / 3.0
-    cut = 0
+    count, kept, cut = len(record.v), belief.kept, 0
+    turns = reversals(engaged(record.v, problem.at(fit).p, fit.gap))
+    drift = setup.drift**2 * count / 3.0
     if count >= settings.LONGEST or (
             count > 4 * settings.PREDICTED and (drift > np.diag(fit.crossings_cov)).any()):
         cut = count // 3

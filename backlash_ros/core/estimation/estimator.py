@@ -77,9 +77,8 @@ class MovingHorizon(Law):
         self.estimate = replace(initial, status=Status.ACQUIRING)
         family, root = PlantFamily(model.transfer_function, uncertainty), sample_period**0.5
         self._setup = Setup(
-            family, noise_std, bounds, bounds.c_r[1] - bounds.c_l[0], initial.c_r - initial.c_l,
-            walk_std * root, np.array(drift_std) * root,
-        )
+            family, max(noise_std, 1e-12), bounds, bounds.c_r[1] - bounds.c_l[0],
+            initial.c_r - initial.c_l, walk_std * root, np.array(drift_std) * root)
         self._channel = (executor or Executor()).open(3, settings.LONGEST + 16_384)
         self._belief = Belief()
         if initial.learned:
@@ -152,9 +151,9 @@ class MovingHorizon(Law):
     def retune(self, p: Parameters) -> None:
         root = p.sample_period**0.5
         self._setup = replace(
-            self._setup, walk_std=p.estimator.input_noise_std * root,
-            drift=np.array(p.estimator.drift_std) * root, noise_std=p.estimator.output_noise_std,
-        )
+            self._setup, noise_std=max(p.estimator.output_noise_std, 1e-12),
+            walk_std=p.estimator.input_noise_std * root,
+            drift=np.array(p.estimator.drift_std) * root)
 
     def close(self) -> None:
         self._channel.close()
@@ -192,10 +191,8 @@ class MovingHorizon(Law):
         if channel.busy or not due or not self.adapting or resting:
             return
         following.beyond += following.surprised  # once
-        channel.submit(
-            fitted, setup, self._belief, following.model.transfer_function, self._xi,
-            since=self._belief.kept.first,
-        )
+        channel.submit(fitted, setup, self._belief, following.model.transfer_function, self._xi,
+                       since=self._belief.kept.first)
         self._take(channel.poll())
 
     def _take(self, result: Fitted | Failure | None) -> None:

@@ -34,9 +34,6 @@ class Setup:
     walk_std: float  # of u per square root of a sample
     drift: Array  # of m, c_r, c_l, as well (3,)
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, 'noise_std', max(self.noise_std, 1e-12))
-
     def problem(self, record: Window, older: Prior | None = None) -> Problem:
         return Problem(self.family, record.v, record.y, self.noise_std, older)
 

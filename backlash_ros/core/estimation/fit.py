@@ -88,7 +88,7 @@ class Problem:
         return np.asarray(np.maximum(1.0 - np.abs(place - np.arange(knots)[:, None]), 0.0))
 
     def _walk_of(self, f: WindowFit) -> tuple[Array, Array, float]:
-        """The same, none where u does not walk; values of the knots; std of their differences."""
+        """The same where u walks, values of the knots, and deviation of their differences."""
         if not f.walk_std:
             return np.zeros((0, len(self.v))), np.zeros(0), 1.0
         knots = f.knots if len(f.knots) == len(self._walk) else np.zeros(len(self._walk))
@@ -173,7 +173,7 @@ class Problem:
         beta = np.concatenate([x, knots, [f.p0], f.theta])
         of_samples = np.vstack([jacobian.T, jacobian @ beta + score / information])
         of_samples *= np.sqrt(information * run.weights)
-        at, last_knot = len(x) + len(knots) + 1, len(x) + len(knots) - 1  # at: place of m
+        at = len(x) + len(knots) + 1  # place of m
         *unit, target = np.eye(len(beta) + 1)
         p0, gap, older = unit[at - 1], unit[at + 2], self.older
         begin = sqrt(12.0) / max(f.gap, 1e-9) * (p0 + (first + 0.5 * f.gap) * target) \
@@ -185,8 +185,7 @@ class Problem:
             *unit[at + 3:at + 3 + self.family.leaks],
             # What no reading tells, as where the first were lost, would grow without bounds.
             *(row / (vague * max(float(np.abs(self.y).max()), 1e-300)) for row in unit[:len(x)]),
-            *((unit[k] - (k < last_knot) * unit[k + 1]) / knot_std
-              for k in range(len(x), last_knot + 1)),
+            *-np.diff([*unit[len(x):at - 1], 0.0 * target], axis=0) / knot_std,
         ]
         beside.extend(np.column_stack([np.zeros((len(older.rows), at)), older.rows, older.values]))
         return np.hstack([of_samples, np.array(beside).T]).T

@@ -1,12 +1,10 @@
 """Between two fits: u from the play operator, the state of G from an observer with a constant gain.
 
-    p(k) = min(max(p(k-1), v), v + gap),   u = m (p - c_r)
     x_i(k+1) = x_{i+1}(k) - a_i x_1(k) + b_i u(k) + k_i (y(k) - x_1(k))
 
 In this observer form, whose first state is y, a step costs a few products. The gain is that of the
 stationary Kalman filter for white noise on u of the size at which the innovations are as large as
-they are (R. K. Mehra, On the identification of variances and adaptive Kalman filtering, IEEE Trans.
-Automatic Control 15 (1970) 175-184).
+they are (R. K. Mehra, IEEE Trans. Automatic Control 15 (1970) 175-184).
 """
 
 from __future__ import annotations
@@ -27,7 +25,7 @@ from backlash_ros.core.plant.backlash import clamp
 from backlash_ros.core.plant.numerics import lyapunov, riccati
 from backlash_ros.core.plant.transfer_function import Array, StateModel, TransferFunction, powers
 
-# Noise on u, as its stationary share of y in units of the noise of y, that gains are made for.
+# Stationary share of y of the noise on u, in units of the noise of y, that gains are made for.
 RATIOS = tuple(10.0**exponent for exponent in range(-4, 5))
 
 
@@ -170,7 +168,6 @@ class Following:
         return none if self.before is None else self.before.x_hat.tolist()
 
     def change_model(self, model: StateModel) -> None:
-        """Give the state of this G from now on."""
         self.model = model
         if self.before is not None:
             self.before = self.before.with_model(model)

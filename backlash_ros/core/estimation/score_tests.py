@@ -92,12 +92,12 @@ def likelier(
         moved = play(acting, fit.gap, float(p[k - 1]) if k else fit.p0) - p[k:k + reach]
         return lfilter(b, a, fit.m * moved) * known[k:k + reach]
 
-    # Most move p for one interval alone: for these all is known from what a move by 1 adds.
-    pulse, begin = lfilter(b, a, fit.m * (np.arange(reach) == 0.0)), open_[0]
-
     def sums(values: Array, weights: Array) -> Array:
-        padded = np.pad(values[begin:], (0, reach - 1))
-        return np.asarray(np.correlate(padded, weights)[open_ - begin])
+        padded = np.pad(values[open_[0]:], (0, reach - 1))
+        return np.asarray(np.correlate(padded, weights)[open_ - open_[0]])
+
+    # Most move p for one interval alone: for these all is known from what a move by 1 adds.
+    pulse = lfilter(b, a, fit.m * (np.arange(reach) == 0.0))
 
     squares = sums(known, pulse**2) - sum(sums(column, pulse)**2 for column in q.T)
     for _ in range(200):  # swaps of one look

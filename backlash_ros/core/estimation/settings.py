@@ -1,7 +1,4 @@
-"""What the estimator is tuned by: every constant with its meaning and unit.
-
-What is used once, as part of one formula, stands there by name; so do guards against rounding.
-"""
+"""What the estimator is tuned by; what belongs to one formula alone stands there by name."""
 
 # --- what counts as known
 STD_SLOPE = 0.2  # standard deviation of m over m, below which an estimate is published

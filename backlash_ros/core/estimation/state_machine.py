@@ -18,14 +18,7 @@ import numpy as np
 
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.estimation import settings
-from backlash_ros.core.estimation.belief import (
-    Belief,
-    Look,
-    State,
-    Trial,
-    published,
-    shortened,
-)
+from backlash_ros.core.estimation.belief import Belief, State, Trial, published, shortened
 from backlash_ros.core.estimation.explanations import Setup, Window, afresh, mixed, outliers
 from backlash_ros.core.estimation.fit import FEW_STEPS, Problem
 from backlash_ros.core.estimation.posterior import Prior, WindowFit
@@ -50,10 +43,9 @@ def learn(setup: Setup, record: Window, before: Belief) -> Belief:
 def _begun_anew(before: Belief, first: int, end: int, next_at: int) -> Belief:
     """Nothing is known of the samples; what was published stays."""
     return before._replace(
-        reason=before.reason if before.fit is None else Status.INCONSISTENT, fit=None,
-        found=None, doubt_from=None, end=end, next_at=next_at,
-        kept=before.kept._replace(first=first, older=None),
-    )
+        reason=before.reason if before.fit is None else Status.INCONSISTENT, fit=None, found=None,
+        doubt_from=None, end=end, next_at=next_at,
+        kept=before.kept._replace(first=first, older=None))
 
 
 def _searching(setup: Setup, record: Window, before: Belief) -> Belief:
@@ -61,7 +53,7 @@ def _searching(setup: Setup, record: Window, before: Belief) -> Belief:
     count, tried = len(record.v), before.found
     soon = record.end + max(count // BLOCKS, FEWEST)
     known_once = tried is not None and setup.is_known(tried)
-    if tried is not None and not known_once and record.end < before.thorough.at \
+    if tried is not None and not known_once and record.end < before.thorough[0] \
             and not setup.is_known(tried, record.turns(max(tried.gap, 0.0), tried.p0)):
         return before._replace(end=record.end, next_at=soon)
     # What many reversals do not tell, a few more will not.
@@ -77,7 +69,7 @@ def _searching(setup: Setup, record: Window, before: Belief) -> Belief:
         if newest is not None and setup.is_known(newest):
             found, part = newest, shorter
             break
-    after = before._replace(end=record.end, next_at=search_at, thorough=Look(search_at),
+    after = before._replace(end=record.end, next_at=search_at, thorough=(search_at, 0.0),
                             found=None, reason=why, coasts=False)
     if found is None:
         return after
@@ -142,7 +134,7 @@ def _adopted(
         kept=before.kept._replace(first=record.first, older=older),
         trial=Trial(must, 0, fit.noise),
         next_at=record.end + max(count // BLOCKS, FEWEST),
-        thorough=Look(record.end + count // 4, 0.5 * fit.gap_std),
+        thorough=(record.end + count // 4, 0.5 * fit.gap_std),
     ), fit)
 
 
@@ -182,8 +174,8 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
     after = before._replace(
         end=record.end, next_at=record.end + max(count // BLOCKS, FEWEST), kept=kept,
         trial=trial._replace(predicted=trial.predicted + count - new))
-    narrow = fit.gap_std < before.thorough.gap_std and count <= SHORT_RECORD
-    if narrow or record.end >= before.thorough.at:
+    look_at, look_below = before.thorough
+    if record.end >= look_at or (fit.gap_std < look_below and count <= SHORT_RECORD):
         fit, other = problem.with_intervals(fit), None
         short = count <= SHORT_RECORD and isnan(problem.older.v)
         if short:
@@ -192,7 +184,7 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
             known = other is not None and setup.is_known(other, settings.REVERSALS)
             fit = mixed(problem, fit, [other] if other is not None and known else [])
         fit = problem.with_walk(fit, setup.walk_std)
-        after = after._replace(thorough=Look(record.end + 2 * count // 5, 0.5 * fit.gap_std))
+        after = after._replace(thorough=(record.end + 2 * count // 5, 0.5 * fit.gap_std))
     else:
         fit = problem.finished(fit)
     after = after._replace(coasts=coasts(problem, fit))
@@ -239,8 +231,7 @@ def _doubted(setup: Setup, record: Window, before: Belief) -> Belief:
         lost = frozenset(range(since, record.end - PREDICTED))
         return after._replace(
             doubt_from=None, kept=kept._replace(rejected=kept.rejected | lost),
-            end=record.end - 1, next_at=record.end,
-        )
+            end=record.end - 1, next_at=record.end)
     if newer >= PREDICTED:
         after = after._replace(reason=Status.INCONSISTENT)
     short = max(SHORT_RECORD, 4 * setup.family.memory)
