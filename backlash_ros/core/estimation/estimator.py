@@ -124,18 +124,14 @@ class MovingHorizon(Law):
         outside = setup.outside_bounds(found) if found and setup.is_precise(found) else []
         return LawReport(
             noise_ratio=nan if belief.fit is None else belief.fit.noise / setup.noise_std,
-            unexplained=nan if fit is None else fit.unexplained,
+            unexplained=nan if fit is None else fit.unexplained, coasts=belief.coasts,
             unconfirmed=belief.inherited is not None and belief.fit is None,
-            coasts=belief.coasts,
             wrong_sign=found is not None and found.m < 0.0,
             undecided=belief.published is None and found is not None and found.m > 0.0
             and found.left.turns >= settings.HELD_REVERSALS,
             forbidden=outside[0] if outside else None,
-            waiting=self._channel.record.end - belief.end,
-            outliers=self._following.outliers,
-            reattributed=self._reattributed,
-            failed_fits=self._failed_fits,
-        )
+            waiting=self._channel.record.end - belief.end, outliers=self._following.outliers,
+            reattributed=self._reattributed, failed_fits=self._failed_fits)
 
     def response_std(self, z: NDArray[np.complex128]) -> Array:
         fit, family = self._belief.fit, self._setup.family
@@ -164,8 +160,7 @@ class MovingHorizon(Law):
             before, end = self._belief, self._channel.record.end
             self._belief = Belief(
                 kept=Kept(first=end), end=end, next_at=end + settings.FIRST_FIT,
-                published=before.published, inherited=before.inherited or before.published,
-            )
+                published=before.published, inherited=before.inherited or before.published)
             self._skipping_fit = self._channel.busy
         self._recording = self.adapting
         self._lost_in_a_row = self._lost_in_a_row + 1 if y is None else 0

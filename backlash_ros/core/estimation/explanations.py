@@ -76,10 +76,8 @@ class Setup:
         values = f.crossings
         apart = np.abs(values - self.bounds.project(*values.tolist()))
         outside = apart > settings.BY_CHANCE * f.crossings_std + 1e-9 * np.abs(values)
-        return [
-            OutOfBounds(name, float(value), getattr(self.bounds, name))
-            for name, value, out in zip(('m', 'c_r', 'c_l'), values, outside, strict=True) if out
-        ]
+        return [OutOfBounds(name, float(value), getattr(self.bounds, name)) for name, value, out
+                in zip(('m', 'c_r', 'c_l'), values, outside, strict=True) if out]
 
 
 class Window(NamedTuple):
@@ -93,7 +91,6 @@ class Window(NamedTuple):
 
     @property
     def end(self) -> int:
-        """Number of the sample after the last one."""
         return self.first + len(self.v)
 
     def between(self, first: int, end: int | None = None) -> Window:
@@ -103,7 +100,6 @@ class Window(NamedTuple):
         return Window(self.first + begin, self.v[part], self.y[part], self.other[part])
 
     def places(self, numbers: frozenset[int]) -> list[int]:
-        """Where samples of these numbers stand."""
         return [k - self.first for k in numbers if self.first <= k < self.end]
 
     def swapped(self, numbers: frozenset[int]) -> Window:
@@ -119,7 +115,6 @@ class Window(NamedTuple):
         return self._replace(y=y)
 
     def turns(self, gap: float, p0: float) -> int:
-        """Reversals of the engaged side."""
         return len(reversals(engaged(self.v, play(self.v, gap, p0), gap)))
 
 

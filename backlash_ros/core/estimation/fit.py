@@ -46,8 +46,7 @@ class Run(NamedTuple):
 class Problem:
     """A record v, y (N,), y nan where lost, with what is known beside it.
 
-    noise_std: nominal, a weak prior. older: what samples before the record say. step: of the
-    readings, None to be told from them.
+    noise_std: nominal, a weak prior. step: of the readings, None to be told from them.
     """
 
     def __init__(
@@ -120,7 +119,6 @@ class Problem:
         Gap and beginning are where they can be. held: whether the gap stays, so that all else fits
         it; begun: whether the beginning does. Raises LinAlgError where the numbers get too large.
         """
-        least = 1e-9  # gap over the swing of v: with none at all, neither side would be told
         from scipy.linalg.lapack import dtrtri  # where fits are made: 31 MB
 
         r, run = self._triangle(f, held, begun), self.at(f)
@@ -139,7 +137,8 @@ class Problem:
             f, r[n:, n:], squares, freedom, most_scale)
         beta = of_eta @ r[:n, -1] + of_xi @ xi
         swing, first = float(np.ptp(self.v)), float(self.v[0])
-        beta[at + 2] = gap = min(max(beta[at + 2], least * swing), 2.0 * swing)
+        # With no gap at all, neither side would be told.
+        beta[at + 2] = gap = min(max(beta[at + 2], 1e-9 * swing), 2.0 * swing)
         p0 = float(beta[at - 1])
         cov = noise * of_eta @ of_eta.T + of_xi @ cov_xi @ of_xi.T
         volume -= float(np.log(np.maximum(diagonal, 1e-300)).sum())
@@ -147,8 +146,7 @@ class Problem:
         return replace(
             f, x=beta[:order], knots=beta[order:at - 1], theta=beta[at:],
             p0=min(max(p0, first), first + gap) if isnan(self.older.v) else p0,
-            scale=scale, cov=cov[at:, at:], volume=volume - len(knots) * log(knot_std),
-        )
+            scale=scale, cov=cov[at:, at:], volume=volume - len(knots) * log(knot_std))
 
     def remembered(self, f: WindowFit) -> Prior:
         """What the record and what is known beside it say of theta, but for the prior of xi."""
@@ -186,8 +184,7 @@ class Problem:
             # What no reading tells, as where the first were lost, would grow without bounds.
             *(row / (vague * max(float(np.abs(self.y).max()), 1e-300)) for row in unit[:len(x)]),
             *-np.diff([*unit[len(x):at - 1], 0.0 * target], axis=0) / knot_std,
-        ]
-        beside.extend(np.column_stack([np.zeros((len(older.rows), at)), older.rows, older.values]))
+            *np.column_stack([np.zeros((len(older.rows), at)), older.rows, older.values])]
         return np.hstack([of_samples, np.array(beside).T]).T
 
     def jacobian(self, f: WindowFit) -> Array:
@@ -237,7 +234,6 @@ class Problem:
     def _stepped(
         self, f: WindowFit, best: float, weights: Array, most_scale: float, begun: bool = False,
     ) -> tuple[WindowFit, WindowFit, float]:
-        shortest_step = 0.05  # share of a Gauss-Newton step that is tried
         new = self.step(f, most_scale, begun=begun)
         there = self._towards(f, new)
         value = self.log_posterior(there, weights)
@@ -248,16 +244,15 @@ class Problem:
             if of_again > best:
                 there, value = again, of_again
         length = 1.0
-        while not value > best - 0.5 and length > shortest_step:
+        while not value > best - 0.5 and length > 0.05:
             length *= 0.3
             there = self._towards(f, new, length)
             value = self.log_posterior(there, weights)
         return new, there, value
 
     def _towards(self, f: WindowFit, new: WindowFit, share: float = 1.0) -> WindowFit:
-        longest = 2.0  # prior deviations by which G moves at once
         furthest = float(np.abs(new.theta[3:] - f.theta[3:]).max(initial=0.0))
-        length = share * min(longest / max(furthest, longest), 1.0)
+        length = share * (2.0 / max(furthest, 2.0))  # of G two prior deviations at once, at most
         order, knots = max(len(f.x), len(new.x)), self._walk_of(f)[1]
         old, x = padded(f.x, order), padded(new.x, order)
         return replace(

@@ -57,8 +57,7 @@ def gain_of(model: StateModel, ratio: float) -> Gain:
         return Gain((0.0,) * n, 1.0, np.eye(n), 1.0)
     return Gain(
         tuple((model.to_observer @ column).tolist()), sqrt(variance),
-        p - np.outer(column, column) * variance, sqrt(float(c @ quiet @ c) + 1.0),
-    )
+        p - np.outer(column, column) * variance, sqrt(float(c @ quiet @ c) + 1.0))
 
 
 class Observer:

@@ -103,8 +103,7 @@ class PlantFamily:
         gain = sum(stable) / self._gain
         b = [0j] * (self._delay + whole - 1) + [
             gain * (x + (lag - whole) * move + width * wide)
-            for x, move, wide in zip(*self._taps, strict=True)
-        ]
+            for x, move, wide in zip(*self._taps, strict=True)]
         a = _product(stable, self._rest, integrator or [1.0])
         while not self.count and not b[-1]:  # the same length at every xi, where there are any
             b.pop()

@@ -97,15 +97,12 @@ def independence(
 
 
 class Prior(NamedTuple):
-    """What older samples say: R theta = d + noise of deviation 1, shapes (r, 3 + K), (r,).
-
-    v: at the last engagement, nan where it is unknown; left: on which side that was.
-    """
+    """What older samples say: R theta = d + noise of deviation 1, shapes (r, 3 + K), (r,)."""
 
     rows: Array
     values: Array
-    v: float = nan
-    left: bool = False
+    v: float = nan  # at the last engagement, nan where it is unknown
+    left: bool = False  # whether that was on the left side
 
 
 class Left(NamedTuple):
@@ -242,10 +239,8 @@ def agree(one: Array, other: Array, cov: Array) -> bool:
 def error_of_plant(
     f: WindowFit, r: Array, squares: float, freedom: float, most_scale: float,
 ) -> tuple[Array, Array, float, float, float]:
-    """xi (K,), its covariance, its scale, what it adds to the evidence, variance of the noise.
-
-    r: triangle of xi (K + 1, K + 1). The variance is over that of f; with intervals it is 1.
-    """
+    """xi (K,), its covariance and scale, what it adds to the evidence, variance of the noise over
+    that of f; r: triangle of xi (K + 1, K + 1)."""
     k, variance = len(r) - 1, 1.0 if f.step else squares / freedom
     if not k:
         return np.zeros(0), np.zeros((0, 0)), f.scale, 0.0, variance

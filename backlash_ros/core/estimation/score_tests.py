@@ -66,9 +66,8 @@ def likelier(
 ) -> tuple[Window, frozenset[int]]:
     """The record as it is likelier from `since` on, and where in it the other command acted.
 
-    back: numbers of the samples over which the other one acts already: its odds are the reverse.
+    back: numbers of the samples over which it acts already.
     """
-    own_noise = 0.25  # of correlated residuals: what is noise of readings
     open_ = np.flatnonzero(np.isfinite(record.other))
     count, late = len(open_), len(record.places(back))
     open_ = open_[open_ >= since - record.first]
@@ -81,8 +80,8 @@ def likelier(
     q = _basis(problem.jacobian(fit) * known[:, None])
     residual = problem.at(fit).error.copy()
     # Correlated residuals are for the most part made by the commands that are looked for.
-    noise = fit.noise * (own_noise if fit.systematic else 1.0)
-    noise = max(noise, problem.nominal, problem.step_of_readings / sqrt(12.0))
+    noise = max(fit.noise * (0.25 if fit.systematic else 1.0), problem.nominal,
+                problem.step_of_readings / sqrt(12.0))
     v, other = record.v.copy(), record.other.copy()
     swapped = before = np.isin(record.first + open_, list(back))
 
@@ -98,7 +97,6 @@ def likelier(
 
     # Most move p for one interval alone: for these all is known from what a move by 1 adds.
     pulse = lfilter(b, a, fit.m * (np.arange(reach) == 0.0))
-
     squares = sums(known, pulse**2) - sum(sums(column, pulse)**2 for column in q.T)
     for _ in range(200):  # swaps of one look
         p = play(v, fit.gap, fit.p0)
@@ -129,5 +127,4 @@ def _clamped(before: Array, v: Array, gap: float) -> Array:
 
 
 def _basis(columns: Array) -> Array:
-    """Orthonormal columns of the same span (N, P)."""
     return np.linalg.qr(columns / np.maximum(np.abs(columns).max(axis=0), 1e-300))[0]

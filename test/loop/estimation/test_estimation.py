@@ -90,11 +90,15 @@ def test_estimates_freeze_while_v_stays_within_the_gap(what: str) -> None:
     if what == 'at rest':
         loop.reference = lambda t: 10.0 * sin(12.6 * min(t, 0.01 * begin))
 
-    def limit(k: int) -> None:
-        if what == 'v is limited' and k == begin:
-            loop.controller.limits = Limits(-2.0, 2.0)
+    reference = loop.reference
 
-    run = loop.run(2500, limit)
+    def limited(t: float) -> float:
+        if what == 'v is limited' and round(t / 0.01) == begin:
+            loop.controller.limits = Limits(-2.0, 2.0)
+        return reference(t)
+
+    loop.reference = limited
+    run = loop.run(2500)
     status = run.column('status')
     [first, *_] = begin + np.flatnonzero(status[begin:] == Status.NOT_EXCITED)
     assert (status[first:] == Status.NOT_EXCITED).all()
