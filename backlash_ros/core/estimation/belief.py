@@ -92,10 +92,7 @@ def published(setup: Setup, belief: Belief, fit: WindowFit) -> Belief:
 
 
 def _beside_inherited(setup: Setup, belief: Belief, fit: WindowFit, known: Known) -> Belief:
-    """The same where something was known before the run.
-
-    What samples leave unexplained may be gap as well, and a gear's lost motion differs by motion.
-    """
+    # What samples leave unexplained may be gap too, and a gear's lost motion differs by motion.
     replacing = 0.05  # std of the gap over the gap, from which samples alone replace what was known
     doubt = (fit.unexplained * fit.gap) ** 2 / 2.0
     cov = fit.crossings_cov + doubt * np.diag([0.0, 1.0, 1.0])

@@ -124,8 +124,7 @@ def afresh(
 ) -> WindowFit | None:
     """The best fit from nothing, mixed with other gaps that fit about as well; None for none.
 
-    like: G is about that of this fit. also: where to begin as well. walks: whether u may walk. A
-    fit with m < 0 says that y goes the other way.
+    like: with about this G. also: where to begin as well. walks: whether u may walk.
     """
     family, swing, first = setup.family, float(np.ptp(record.v)), float(record.v[0])
     if np.isfinite(record.y).sum() < 15 + 2 * family.count or not swing:
@@ -192,10 +191,9 @@ def _apart(one: WindowFit, other: WindowFit) -> Array:
 
 
 def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]:
-    """What readings leave open along the gap, all else fitted (3, 3), and fits that it leads to.
+    """What readings leave open along the gap, all else fitted (3, 3), and fits that lie beyond.
 
-    r deviations from the best they should be less likely by r^2 / 2. Where they are less likely by
-    half of that only, another fit may lie beyond, with other samples at which a side is engaged.
+    r deviations from the best they should be less likely by r^2 / 2; half of that tells another.
     """
     out, beyond = np.zeros((3, 3)), list[WindowFit]()
     if not best.valid or not best.gap > 0.0 or not best.cov[2, 2] > 0.0:

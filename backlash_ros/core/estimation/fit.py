@@ -2,10 +2,9 @@
 
     y = G(z; xi) [m p(v; g, p0) - o + d] + X / A(z; xi) + e,   o = m c_r,   xi ~ N(0, s^2)
 
-X: state before the record. d: disturbance that walks to 0 at its end (o is that of its end). p0, g:
-beginning and gap of the play. The noise and the scale s are integrated out in closed form (Normal-
-Gamma) over a grid of s, whose prior is log-normal around 1: G is about as wrong as configured. The
-derivatives by g and p0 are 1 where the left side was engaged last, and where none was.
+X: state before the record. d: disturbance that walks to 0 at its end. p0, g: beginning and gap of
+the play. The noise and the scale s are integrated out in closed form (Normal-Gamma) over a grid of
+s, whose prior is log-normal around 1: G is about as wrong as configured.
 """
 
 from dataclasses import replace
@@ -116,8 +115,7 @@ class Problem:
     ) -> WindowFit:
         """The values that the linearization around f makes likeliest, with their posterior.
 
-        Gap and beginning are where they can be. held: whether the gap stays, so that all else fits
-        it; begun: whether the beginning does. Raises LinAlgError where the numbers get too large.
+        held, begun: whether the gap, or the beginning, stays. Raises LinAlgError for no numbers.
         """
         from scipy.linalg.lapack import dtrtri  # where fits are made: 31 MB
 
@@ -161,8 +159,7 @@ class Problem:
         return np.asarray(np.triu(dgeqrf(rows, overwrite_a=1)[0][:rows.shape[1]]))
 
     def rows(self, f: WindowFit, held: bool = False, begun: bool = False) -> Array:
-        """The least squares of a step (N + B, P + 1): samples, what is known beside; target last.
-        """
+        """Least squares of a step: samples, what is known beside; target last (N + B, P + 1)."""
         vague = 100.0  # prior deviation of the state before a record, over the largest reading
         tight = 1e6  # weight of what is held
         run, jacobian, first = self.at(f), self.jacobian(f), self.v[0]
@@ -294,11 +291,9 @@ class Problem:
         return replace(f, x=best[:len(run.a) - 1], theta=theta)
 
     def with_intervals(self, f: WindowFit) -> WindowFit:
-        """The finished fit, by intervals where readings have a step that the noise does not hide.
-
-        The noise beside the rounding is the likeliest of a grid, but as large as leaves a reading
-        near an edge of its interval for every unknown: fewer are no normal posterior.
-        """
+        """The finished fit, by intervals where the noise does not hide the step of readings."""
+        # The noise beside it is the likeliest of a grid, but as large as leaves a reading near an
+        # edge of its interval for every unknown: fewer are no normal posterior.
         step, unknowns = self.step_of_readings, len(f.x) + len(f.knots) + 1 + len(f.theta)
         largest = 0.25 * step
         edges = unknowns / max(float(self.at(f).weights.sum()), 1.0)

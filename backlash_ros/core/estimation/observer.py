@@ -61,15 +61,15 @@ def gain_of(model: StateModel, ratio: float) -> Gain:
 
 
 class Observer:
-    """Follows the state of G, kept in the observer form.
+    """Follows the state of G, kept in the observer form; before: that of another G for this plant.
 
-    before: that of another G for the same plant: innovations are no larger with this one. variance:
-    of the innovation, measured. cov: of the state in the coordinates of StateModel, (n, n).
+    variance: of the innovation, measured. cov: of the state as StateModel has it (n, n).
     """
 
     def __init__(
         self, model: StateModel, noise_std: float, before: Observer | None = None,
     ) -> None:
+        # Innovations are no larger than with a G from before.
         self._model, highest = model, len(RATIOS) if before is None else before.level
         self._use(min(len(RATIOS) // 2, highest), noise_std)
         self.variance = (self._gain.innovation * noise_std) ** 2
@@ -89,8 +89,7 @@ class Observer:
         return [sum(map(mul, row, self._x)) for row in self._to_state]
 
     def place(self, x: Array, known: bool) -> None:
-        """Go on from the state x in the observer form, which newer samples move little if `known`.
-        """
+        """Go on from this x in the observer form, which newer samples move little if `known`."""
         self._x[:] = x.tolist()
         if known:
             self._use(0, self.noise_std)
@@ -138,8 +137,7 @@ def state_after(model: TransferFunction, u: Array, y: Array) -> Array:
 class Following:
     """Follows play operator and state of G from sample to sample.
 
-    model: G of the structure that asks for the state. before: gives the state until a backlash is
-    known, observer: from then on. u: before the newest y, nan until then. since_motion: samples
+    before: gives the state until a backlash is known, observer: from then on. since_motion: samples
     since p moved, v until then. outliers: readings that did not move the state. beyond: as many in
     a row, and those after them.
     """
@@ -206,10 +204,9 @@ class Following:
     def go_on_from(
         self, place: Place, newer: Array, estimate: Estimate, noise_std: float, known: bool,
     ) -> None:
-        """Let play and observer stand where a fit says that they stood, and step to now.
+        """Let play and observer stand where a fit says that they stood; take in newer v, y (2, M).
 
-        newer: v and y of the samples since then (2, M). known: whether the fit knows the state
-        better than the newest samples do.
+        known: whether the fit knows the state better than the newest samples do.
         """
         own, other = self.model.transfer_function, place.model
         if not (np.array_equal(other.denominator, own.denominator)

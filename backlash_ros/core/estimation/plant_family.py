@@ -3,11 +3,9 @@
     G(z; xi) = z^-d [B (1 - f + f z^-1) + xi_w w (1 - z^-1)^2 B'] A(1)/A_nominal(1) / (A I)
 
 xi (K,), in units of prior deviations: where G integrates, the leak of an integrator; the lag (d + f
-samples beside the nominal delay, d whole); the width of the response, w = 1/8 at most, B' = B one
-sample shorter; ln Omega, ln D of every section s^2 + 2 D Omega s + Omega^2 of two poles (a real
-pair is D >= 1, so that there is no edge); ln of a single real pole. What acts a part t of a sample
-late has the lag t and the width -t (1 - t) / 2. Poles at 0, on the negative axis or outside of the
-unit circle stay.
+samples beside the nominal delay, d whole); the width of the response, w = 1/8, B' = B one sample
+shorter; ln Omega, ln D of every section s^2 + 2 D Omega s + Omega^2 of two poles; ln of a single
+real pole. Poles at 0, on the negative axis or outside of the unit circle stay.
 """
 
 from cmath import cos, exp, sqrt
@@ -43,8 +41,8 @@ class Family(Protocol):
 class PlantFamily:
     """G(z; xi) around a nominal G, the model.
 
-    uncertainty: relative prior deviation of its frequencies, damping ratios and delay; 0 where G is
-    exact, K = 0. memory: samples after which the slowest stable mode has died out, within reason.
+    uncertainty: relative prior deviation of its frequencies, damping and delay; 0: K = 0. memory:
+    samples after which the slowest stable mode has died out, within reason.
     """
 
     def __init__(self, model: TransferFunction, uncertainty: float) -> None:
