@@ -203,9 +203,9 @@ class WorkerExecutor(Executor):
                 record = channel.record
                 first = max(sent.get(channel.number, 0), record.first)
                 new = record.values_between(first, channel.end).tobytes()
-                samples = record.quantities, first, new
+                request = channel.number, [*self._channels], record.quantities, first, new, job
                 try:
-                    pickle.dump((channel.number, [*self._channels], samples, job), worker.stdin, -1)
+                    pickle.dump(request, worker.stdin, -1)
                     worker.stdin.flush()
                     asked, sent[channel.number] = True, channel.end
                     size = int.from_bytes(worker.stdout.read(8), 'little')
@@ -232,8 +232,8 @@ class WorkerExecutor(Executor):
 
 
 def _start(preload: tuple[str, ...]) -> subprocess.Popen[bytes]:
-    code = f'import sys; sys.path[:] = {sys.path!r}; ' \
-        f'from {__name__} import serve; serve({preload!r})'
+    code = f'import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve; ' \
+        f'serve({preload!r})'
     process = subprocess.Popen(
         [sys.executable, '-c', code], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
         # In a session of its own it gets no Ctrl-C, not even while it starts, and what it takes of
@@ -277,7 +277,7 @@ def serve(preload: Sequence[str] = ()) -> None:
     share, burst_s = 0.25, 5.0
     credit_s, since = burst_s, time.monotonic()
     while True:
-        number, still_open, (quantities, first, block), job = requests.get()
+        number, still_open, quantities, first, block, job = requests.get()
         began = time.process_time()
         if number not in records or records[number].end != first:
             records[number] = SampleBuffer(quantities, first)
@@ -295,11 +295,10 @@ def serve(preload: Sequence[str] = ()) -> None:
 
 def _receive(requests: SimpleQueue[Any]) -> None:
     """Read requests, also while a job is computed, and end the process with the pipe."""
-    while True:
-        try:
+    with suppress(EOFError, pickle.UnpicklingError):
+        while True:
             requests.put(pickle.load(sys.stdin.buffer))
-        except (EOFError, pickle.UnpicklingError):
-            os._exit(0)
+    os._exit(0)
 
 
 def _result_of(job: bytes, record: SampleBuffer) -> bytes:

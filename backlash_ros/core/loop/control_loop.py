@@ -19,31 +19,17 @@ from backlash_ros.core.parameters import NOISE, Parameters
 
 
 class Phase(Enum):
-    """Whether a loop commands, and with what it begins."""
+    """Whether a loop commands, and with what it begins: one small state machine.
+
+    BEGINS → RUNS at the first answer, RUNS → BEGINS when the state of the plant is unknown. Both →
+    SILENT after timeout.plant_output, and from there → BEGINS with the next output. All →
+    STANDS_DOWN when another controller was first, and from there → BEGINS when it is gone.
+    """
 
     BEGINS = 'begins'
     RUNS = 'runs'
     SILENT = 'silent'
     STANDS_DOWN = 'stands down'
-
-
-class Event(Enum):
-    """What happens to a loop: the phases in which it changes anything, and the one that follows."""
-
-    # y and y_m are there, and which v acts, or nobody is going to say it.
-    ANSWER = (Phase.BEGINS,), Phase.RUNS
-    # An output after a silence, a restart of the driver, more lost samples than can be stepped
-    # over; while the loop runs, a reset or an activation: the state of the plant is unknown.
-    INTERRUPTION = (Phase.RUNS, Phase.SILENT), Phase.BEGINS
-    # No output for timeout.plant_output: the commands of on_timeout follow.
-    TIMEOUT = (Phase.BEGINS, Phase.RUNS), Phase.SILENT
-    # Another controller was first, nodes/control/rivals.py says; its commands tell which v acts.
-    RIVAL = (Phase.BEGINS, Phase.RUNS, Phase.SILENT), Phase.STANDS_DOWN
-    RIVAL_GONE = (Phase.STANDS_DOWN,), Phase.BEGINS
-
-    def after(self, phase: Phase) -> Phase:
-        phases, following = self.value
-        return following if phase in phases else phase
 
 
 class Driver(NamedTuple):
@@ -208,7 +194,7 @@ class ControlLoop:
         too_long = self.phase is Phase.RUNS and (gap.missing > LONGEST_GAP or stalled)
         if self.silent or gap.restarted or too_long:
             self.statistics.interruptions += 1
-            self.phase = Event.INTERRUPTION.after(self.phase)
+            self.phase = Phase.BEGINS
             self.commands.origin.restart()
             self.renew(self.estimate)
         return self.phase is Phase.RUNS or p.lockstep or self._may_begin(output)
@@ -241,7 +227,7 @@ class ControlLoop:
         core, commands = self.core, self.commands
         (_, lost, _, unsent), self._gap = self._gap, NEXT_SAMPLE
         if self.phase is Phase.BEGINS:
-            self.phase = Event.ANSWER.after(self.phase)
+            self.phase = Phase.RUNS
             core.start_from(self.v)
             commands.output_ns = stamp_ns
             return core.step(y, y_m)
@@ -270,13 +256,12 @@ class ControlLoop:
     def give_up(self) -> None:
         """The driver is silent: whenever it comes back, its state will be unknown."""
         if self.phase in (Phase.BEGINS, Phase.RUNS):
-            self.phase = Event.TIMEOUT.after(self.phase)
+            self.phase = Phase.SILENT
             self.renew(self.estimate)
             self.end(self._p.on_timeout)
 
     def stand_down(self) -> None:
-        self.phase = Event.RIVAL.after(self.phase)
-        self._ending = iter(())
+        self.phase, self._ending = Phase.STANDS_DOWN, iter(())
 
     def hear_other(self, v: float) -> None:
         if self.standing_down and plausible(v):
@@ -285,8 +270,7 @@ class ControlLoop:
 
     def resume(self) -> None:
         """Command again, from the newest v that was heard; the state of the plant is unknown."""
-        self.phase = Event.RIVAL_GONE.after(self.phase)
-        self.heard.y_at = nan
+        self.phase, self.heard.y_at = Phase.BEGINS, nan
         self.renew(self.estimate)
 
     def end(self, action: str) -> None:
@@ -303,7 +287,7 @@ class ControlLoop:
     def renew(self, estimate: Estimate | None) -> None:
         """Go on from the present v with a new core that begins with these estimates, if any."""
         if self.phase is Phase.RUNS:
-            self.phase = Event.INTERRUPTION.after(self.phase)
+            self.phase = Phase.BEGINS
         before = self.core
         self.core = core = build_controller(self._p, estimate, self.executor)
         core.go_on_from(before)

@@ -46,7 +46,7 @@ class Parameters(ParameterTree, Mapping[str, Value]):
 
     joint_names: tuple[str, ...]
     given: dict[str, object]
-    _values: dict[str, Any]
+    _values: dict[str, Value]
     _of_joints: dict[str, 'Parameters']
 
     def __init__(self, values: Mapping[str, object] | None = None) -> None:
@@ -81,8 +81,7 @@ class Parameters(ParameterTree, Mapping[str, Value]):
         return self._of_joints[joint] if self._of_joints else self
 
     def __getitem__(self, name: str) -> Value:
-        value: Value = self._values[name]
-        return value
+        return self._values[name]
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._values)

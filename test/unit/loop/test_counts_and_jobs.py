@@ -1,7 +1,6 @@
-"""Phases of a loop, counts, lines of the log, period of a driver, joints, jobs computed at once."""
+"""Counts of a loop, lines of the log, period of a driver, joints, jobs computed at once."""
 
 from collections.abc import Iterable, Mapping
-from itertools import product
 from math import isnan
 
 import numpy as np
@@ -10,23 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from backlash_ros.core.jobs import ChannelSamples, Executor
-from backlash_ros.core.loop.control_loop import Event, Phase
 from backlash_ros.core.loop.diagnosis import AGAIN_S, LASTS_S, Finding, Level, LevelLog
 from backlash_ros.core.loop.loop_statistics import Lately, LoopStatistics
 from backlash_ros.core.loop.sample_counter import DriverPeriod
 from backlash_ros.core.parameters import ParameterError, Parameters
-
-
-@pytest.mark.parametrize(('phase', 'event'), list(product(Phase, Event)))
-def test_a_loop_that_stands_down_is_woken_by_nothing_but_the_end_of_its_rival(phase, event):
-    following = event.after(phase)
-    if phase is Phase.STANDS_DOWN:
-        assert (following is phase) == (event is not Event.RIVAL_GONE)
-    if event is Event.RIVAL:
-        assert following is Phase.STANDS_DOWN
-    # Whatever ends a phase but the first answer leads back to a first command.
-    if following is Phase.RUNS:
-        assert phase is Phase.RUNS or event is Event.ANSWER
 
 
 def test_what_was_gained_lately_is_never_negative_after_a_new_beginning() -> None:
