@@ -56,7 +56,7 @@ class TrackingDesign(NamedTuple):
     gentle: Gain  # at rest
     push: float  # |x| after HORIZON samples of u = 1
     push_ahead: float  # |y| after LOOK_AHEAD
-    holding: list[tuple[Array, Array]]  # see _holding, for each of the schedule
+    holding: list[tuple[Array, Array]]  # see _agreed, for each of the schedule
 
     def variances(self, x_cov: Array) -> Array:
         """Of K x for every gain of the schedule, and of |x| at last."""
@@ -84,7 +84,7 @@ def design(model: StateModel, weights: TrackingWeights, factor: float = 1.0) -> 
     return TrackingDesign(
         model, plans, feedback, schedule, schedule[SOFTEST] if bears else None, gentle.tolist(),
         float(np.linalg.norm(later)), model.c * abs(float(ahead[0])),
-        [_holding(model, gain, len(plans[0].states)) for gain in schedule])
+        [_agreed(model, gain, len(plans[0].states)) for gain in schedule])
 
 
 def better_design(
@@ -125,7 +125,7 @@ def dot(a: Sequence[float], b: Sequence[float]) -> float:
     return product
 
 
-def _holding(model: StateModel, gain: Gain, length: int) -> tuple[Array, Array]:
+def _agreed(model: StateModel, gain: Gain, length: int) -> tuple[Array, Array]:
     """(L - 1, n) and (L - 1, L): u that a gain agrees with after it was held.
 
     Held for j samples from x - x* = e on, u is what u*(k+j) - K (x - x*) asks for then:

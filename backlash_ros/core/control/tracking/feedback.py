@@ -120,7 +120,7 @@ class StateFeedback:
             trust.held_for = TRUSTED_AFTER
         elif not trust.full:
             # Beside far larger u even a gap that is hardly known makes little difference.
-            large = max(gap, self.state.width * self._scale / estimate.m)
+            large = max(gap, self.state.width * max(self.state.asked, self.gap_u) / estimate.m)
             sharp = (estimate.std_m < SHARP * estimate.m
                      and estimate.std_c_r + estimate.std_c_l < SHARP * large)
             trust.held_for += trust.sharp_counts if sharp else 1
@@ -164,7 +164,7 @@ class StateFeedback:
         # Per sample, of the bound while the backlash is unknown; samples without a limit after
         # which feedback takes a step back to full.
         widening, stiffen_after = 1.03, 20
-        state, trust, most, noise = self.state, self.trust, self.most, self.noise
+        state, trust, most, noise = self.state, self.trust, self.bounds[0], self.noise
         if trust.held_for:
             off = hypot(*error)
             if held_back or state.bounded:
@@ -221,23 +221,16 @@ class StateFeedback:
         return self.noise.u_std[self._quiet]
 
     @property
-    def _scale(self) -> float:
-        return max(self.state.asked, self.gap_u)
-
-    @property
-    def most(self) -> float:
-        """Largest feedback."""
+    def bounds(self) -> tuple[float, float]:
+        """Largest feedback, and largest |u_d - u*| whatever makes u_d."""
+        scale = max(self.state.asked, self.gap_u)
         if not self.trust.held_for:
             # A wrong slope may make the loop unstable, which bounded feedback slows down.
-            return self.state.width * self._scale
+            return self.state.width * scale, LARGEST_IN_ACQUISITION * scale
         # No error of y that would not matter at rest calls for too much; |K| is what it calls for.
         by_noise = TOLERANCE * self.y_std * hypot(*self._design.schedule[0])
-        return LARGEST_FEEDBACK * max(self._scale, by_noise)
-
-    @property
-    def reach(self) -> float:
-        """Largest |u_d - u*|, whatever makes u_d."""
-        return self.most if self.trust.held_for else LARGEST_IN_ACQUISITION * self._scale
+        most = LARGEST_FEEDBACK * max(scale, by_noise)
+        return most, most
 
 
 def shrunk_crossings(estimate: Estimate, deviations: float, known: bool) -> tuple[float, float]:

@@ -152,7 +152,7 @@ class Tracking(ControlStructure):
         added = hand_over.added
         hand_over.added *= FADING
         u_d += added
-        pull, before = rest.pull_back(deviation, feedback.most), rest.mode
+        pull, before = rest.pull_back(deviation, feedback.bounds[0]), rest.mode
         spread = max(references.high, y_m) - min(references.low, y_m) - references.noise_spread
         mode = rest.decide(y, self._noise_std, references.window.item(0), spread, plan, deviation,
                            None if x_cov is None else feedback.noise.x_std, inverse.side, pull,
@@ -163,7 +163,7 @@ class Tracking(ControlStructure):
             rest.stay(inverse)
         side = self._side(turned, u_d, noise, inverse)
         # Whatever makes u_d: nothing leads it further from what the reference asks for.
-        reach = feedback.reach + (abs(added) if hand_over.widens else 0.0)
+        reach = feedback.bounds[1] + (abs(added) if hand_over.widens else 0.0)
         u_d = min(max(rest.target[0] if mode.steps else u_d, plan.u - reach), plan.u + reach)
         side_before, v_before, trust = inverse.side, inverse.v, feedback.trust
         if mode.steps:
