@@ -234,10 +234,13 @@ def _end(o: Observed, at: At) -> str:
     on, y = max(((float(beyond.max()), f.target[beyond[f.rows] > 0.0])
                  for beyond in (p - max(low, high), min(low, high) - p)), key=lambda end: end[0])
     # A y that only moves less there is at no end.
-    if squares[0] > squares[1] or on < 0.1 or not len(y):
-        return ''
-    return (f'y stays at about {np.median(y):.4g} while v goes on by {f.swing * on:.3g} and more: '
-            'the sensor is at its end, or the load slides there')
+    there = squares[0] <= squares[1] and on >= 0.1 and len(y)
+    return _at_end(float(np.median(y)), f.swing * on) if there else ''
+
+
+def _at_end(y: float, on: float) -> str:
+    return (f'y stays at about {y:.4g} while v goes on by {on:.3g} and more: the sensor is at its '
+            'end, or the load slides there')
 
 
 def _many(v: Array, widest: float, share: float) -> Array:
@@ -269,12 +272,33 @@ def _sticking(v: Array, band: float, jump: float) -> Array:
 # --- what moves y beside v ------------------------------------------------------------------------
 
 
+def _runs(flags: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
+    """The indices of each run of true ones."""
+    true = np.flatnonzero(flags)
+    return np.split(true, np.flatnonzero(np.diff(true) > 1) + 1) if len(true) else []
+
+
+def _held(o: Observed) -> str:
+    """A y that is seen at its end while v goes on."""
+    known = np.isfinite(o.y)
+    # About 1 or -1, but next to 0 where G integrates.
+    along = float(np.corrcoef(o.v[known], o.y[known])[0, 1])
+    within = 4.0 * o.noise + 0.005 * o.swing
+    # What would move y by far more, if it moved.
+    far = max(0.1, 3.0 * within / o.swing) * float(np.ptp(o.v))
+    for end, way in ((np.nanpercentile(o.y, 98.0), 1.0), (np.nanpercentile(o.y, 2.0), -1.0)):
+        on = [float(np.max((o.v[run] - o.v[run[0]]) * way * np.sign(along)))
+              for run in _runs(np.abs(o.y - end) < within)]
+        if abs(along) > 0.3 and sum(size > far for size in on) >= 3:
+            return _at_end(float(end), max(on))
+    return ''
+
+
 def _pushed(o: Observed) -> str:
     """A y that moves while v is at rest."""
     settled = 8  # samples of v at rest, behind as many in which y settles
-    at_rest = np.flatnonzero(np.append(False, (np.diff(o.v) == 0.0) & (np.diff(o.p) == 0.0)))
-    runs = np.split(at_rest, np.flatnonzero(np.diff(at_rest) > 1) + 1)
-    parts = [o.residual[run[settled:]] for run in runs]
+    rest = np.append(False, (np.diff(o.v) == 0.0) & (np.diff(o.p) == 0.0))
+    parts = [o.residual[run[settled:]] for run in _runs(rest)]
     moved = [float(np.nanmax(part) - np.nanmin(part)) for part in parts
              if np.isfinite(part).sum() >= settled]
     # Of white noise, the range of a few dozen readings is some four deviations.
@@ -330,7 +354,7 @@ NONLINEARITIES: tuple[tuple[
      'y sticks until v has gone on by {:.3g} behind each turn, and jumps by what {:.3g} of v move: '
      'friction, as in a valve', 'loosen it'),
 )
-BESIDE_V = ((_pushed, 'hold it, or keep it free'),
+BESIDE_V = ((_held, 'move v less far'), (_pushed, 'hold it, or keep it free'),
             (_creep, 'mend what slips, or measure y without a drift'))
 
 
