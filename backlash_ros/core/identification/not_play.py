@@ -14,6 +14,7 @@ from math import copysign
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from backlash_ros.core.plant.backlash import play
 from backlash_ros.core.plant.numerics import lfilter

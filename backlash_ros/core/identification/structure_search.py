@@ -278,10 +278,24 @@ def selected(compared: Sequence[Compared]) -> Compared:
 
 
 def _eligible(compared: Sequence[Compared]) -> list[Compared]:
-    """Structures that were fitted to the end, those that leave less than there is of y if any."""
+    """Structures that were fitted to the end, without those that are no model if there are others.
+    """
     found = [one for one in compared if np.isfinite(one.criterion)]
-    return [one for one in found
-            if one.whole.squares <= float(np.sum(one.whole.problem.y**2))] or found
+    for useless in (_explains_nothing, _rings):
+        found = [one for one in found if not useless(one.whole)] or found
+    return found
+
+
+def _explains_nothing(found: Model) -> bool:
+    """Whether it leaves more than there is of y, however well its last part is predicted anew."""
+    return found.squares > float(np.sum(found.problem.y**2))
+
+
+def _rings(found: Model) -> bool:
+    """Whether an oscillation hardly dies out over the record: it explains what G does not."""
+    lasting = 4.0  # time constants that a record has to be long
+    poles = np.roots(np.append(1.0, found.a))
+    return bool(np.any((poles.imag != 0.0) & (abs(poles) > 1.0 - lasting / len(found.problem.v))))
 
 
 def gives_way(found: Model, compared: Sequence[Compared]) -> bool:
