@@ -16,16 +16,13 @@ from backlash_ros.core.plant.transfer_function import Array, StateModel
 
 
 class Interval(NamedTuple):
-    """What the controller did between two samples: v was applied, y_m and u_d led to it.
-
-    f: the gain of (3.2) in use. other: v that may have been applied instead, nan for no doubt.
-    """
+    """What the controller did between two samples: v was applied, y_m and u_d led to it."""
 
     v: float
     y_m: float
     u_d: float
-    f: float
-    other: float = nan
+    f: float  # of (3.2)
+    other: float = nan  # v that may have been applied instead, nan for no doubt
 
 
 class OutOfBounds(NamedTuple):
@@ -70,13 +67,12 @@ class StateSource:
 class Law(StateSource):
     """Learns (m, c_r, c_l), and f where it adapts it, from v and y alone.
 
-    Laws inherit from here what they do not do themselves. adapting: whether it learns; otherwise it
-    goes on following the state of G alone. RETUNED: names of parameters that `retune` takes up.
+    Laws inherit from here what they do not do themselves.
     """
 
-    RETUNED: ClassVar[tuple[str, ...]] = ()
+    RETUNED: ClassVar[tuple[str, ...]] = ()  # names of the parameters that `retune` takes up
     estimate: Estimate
-    adapting: bool = True
+    adapting: bool = True  # whether it learns; otherwise it follows the state of G alone
 
     def update(self, y: float | None, interval: Interval) -> None:
         """Take in y(k), None if it was lost, and what was applied from k-1 to k."""
@@ -108,10 +104,7 @@ class Law(StateSource):
         """Give x_hat in the coordinates of this model from now on."""
 
     def response_std(self, z: NDArray[np.complex128]) -> Array:
-        """Relative standard deviation of the response of `learned_model` at z, shape (M,).
-
-        nan where nothing was learned, 0 where G is configured to be exact.
-        """
+        """Relative deviation of the response of `learned_model` at z (M,), nan for none."""
         return np.full(len(z), nan)
 
     @property

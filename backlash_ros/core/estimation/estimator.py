@@ -191,7 +191,6 @@ class MovingHorizon(Law):
         self._take(channel.poll())
 
     def _take(self, result: Fitted | Failure | None) -> None:
-        """Go on from what is believed after the newest fit."""
         if result is None or self._skipping_fit:
             self._skipping_fit = self._skipping_fit and result is None
             return

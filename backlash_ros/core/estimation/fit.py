@@ -74,7 +74,7 @@ class Problem:
         return self._newest[f]
 
     def residual(self, f: WindowFit) -> Array:
-        """y minus what is expected (N,), nan where it was lost."""
+        """Of y (N,), nan where it was lost."""
         return np.where(self.known, self.at(f).error, np.nan)
 
     @cached_property

@@ -5,10 +5,9 @@ is one more column of the fit; its coefficient kappa is 0 where the load stays a
 brakes it (C. R. Rao, Proc. Cambridge Philosophical Society 44 (1948)).
 
 Where one of two commands may have acted over an interval, the other one would add s to y. With s in
-the residuals r, it is (s.r - s.s / 2) / sigma^2 more likely, less the log-odds against it; of both,
-what other unknowns may explain is left out. The likeliest is believed first, until none is likely.
-By Jeffreys' prior of the share of late ones, k of n that were late make the odds of one more (k +
-1/2) to (n - k - 1/2) (A. S. Willsky, H. L. Jones, IEEE Trans. Automatic Control 21 (1976)).
+the residuals r, it is (s.r - s.s / 2) / sigma^2 more likely, less the log-odds against it, by
+Jeffreys' prior (k + 1/2) to (n - k - 1/2) after k of n were late (A. S. Willsky, H. L. Jones, IEEE
+Trans. Automatic Control 21 (1976)). The likeliest is believed first, until none is likely.
 """
 
 from dataclasses import replace

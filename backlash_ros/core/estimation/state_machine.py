@@ -106,7 +106,6 @@ def _with_commands(
 
 
 def _why(setup: Setup, found: WindowFit | None, record: Window, before: Belief) -> Status:
-    """What to say while nothing is known."""
     known = before.published
     if len(record.v) < 100 and before.reason is Status.ACQUIRING:
         return Status.ACQUIRING
@@ -124,7 +123,6 @@ def _why(setup: Setup, found: WindowFit | None, record: Window, before: Belief) 
 def _adopted(
     setup: Setup, record: Window, fit: WindowFit, older: Prior | None, before: Belief,
 ) -> Belief:
-    """The fit of this record, beside what older samples say, is what is believed."""
     count, must = len(record.v), before.trial.must
     another_noise = before.published is None or fit.walk_std > 0.0
     if before.fit is not None and another_noise and fit.alike(before.fit):
