@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from scipy.signal import cont2discrete
+from records import resonance
 
 from backlash_ros.core import Estimate, Parameters, build_closed_loop
 from backlash_ros.core.assembly import build_model, build_true_model
@@ -27,7 +27,7 @@ from backlash_ros.core.control.tracking.tracking import Tracking
 from backlash_ros.core.law import Interval, Law, LawReport
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.parameters.table import TrackingWeights
-from backlash_ros.core.plant.simulated_plant import SimulatedPlant
+from backlash_ros.core.plant.simulated_plant import SimulatedPlant, delayed
 from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
 from backlash_ros.core.simulation.closed_loop import ClosedLoop
 from backlash_ros.core.simulation.run_record import (
@@ -120,11 +120,7 @@ TRUTH = Estimate(0.098, 0.55, -0.35, 0.0)
 
 
 def motor(scale: float = 1.0, damping: float = 0.5, delay: int = 0) -> TransferFunction:
-    w = 40.0 * pi * scale
-    numerator, denominator, _ = cont2discrete(
-        ([w * w], [1.0, 2.0 * damping * w, w * w]), PERIOD, 'zoh'
-    )
-    return TransferFunction(numerator[0][1:].tolist(), [*denominator.tolist(), *[0.0] * delay])
+    return delayed(resonance(20.0 * scale, damping), delay)
 
 
 class Learner(Law):

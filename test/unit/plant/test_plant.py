@@ -3,14 +3,14 @@
 from collections.abc import Callable
 from fractions import Fraction
 from itertools import accumulate, islice
-from math import pi
 
 import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from scipy.signal import cont2discrete, lfilter
+from records import resonance
+from scipy.signal import lfilter
 from strategies import eighths, output_of, paper_example, plants, signals, usual_plays
 
 from backlash_ros.core.assembly import (
@@ -131,17 +131,6 @@ def test_wear_never_ends_in_an_invalid_backlash(changes: dict[str, list[float]])
     assert refusal.value.name.startswith('backlash.')
 
 
-PERIOD = 0.005
-
-
-def motor(frequency: float = 20.0, damping: float = 0.5) -> TransferFunction:
-    w = 2.0 * pi * frequency
-    numerator, denominator, _ = cont2discrete(
-        ([w * w], [1.0, 2.0 * damping * w, w * w]), PERIOD, 'zoh'
-    )
-    return TransferFunction(np.ravel(numerator).tolist(), denominator.tolist())
-
-
 def assert_equal(found: TransferFunction, expected: TransferFunction, tolerance: float) -> None:
     np.testing.assert_allclose(found.numerator, expected.numerator, rtol=0.0, atol=tolerance)
     np.testing.assert_allclose(found.denominator, expected.denominator, rtol=0.0, atol=tolerance)
@@ -158,7 +147,7 @@ def continuous(model: TransferFunction) -> bool:
 
 @pytest.mark.parametrize('factor', [0.5, 0.8, 0.98, 1.02, 1.2, 1.5])
 def test_scaled_frequency_is_the_motor_at_that_frequency(factor: float) -> None:
-    assert_equal(altered_plant(motor(), frequency=factor), motor(20.0 * factor), 1e-12)
+    assert_equal(altered_plant(resonance(20.0), frequency=factor), resonance(20.0 * factor), 1e-12)
 
 
 @given(plants(), st.integers(0, 2), st.integers(1, 3))
