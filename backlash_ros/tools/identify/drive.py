@@ -26,7 +26,7 @@ from backlash_ros.options import BAD_INPUT
 from backlash_ros.tools.cli import BrokenOffError, InputError, StopRequests
 from backlash_ros.tools.config import write_config
 from backlash_ros.tools.identify.outcome import identify_record
-from backlash_ros.tools.records.messages import FEWEST_MESSAGES, as_messages, from_messages
+from backlash_ros.tools.records.messages import FEWEST_MESSAGES, from_messages
 
 
 def drive(
@@ -84,8 +84,7 @@ def _records(file: TextIO, period: float | None) -> Iterator[Record | None]:
         record = None
         if len(heard.get(topics.PLANT_OUTPUT, ())) >= FEWEST_MESSAGES:
             with suppress(RecordError):
-                messages = {topic: as_messages(pairs) for topic, pairs in heard.items()}
-                record = replace(from_messages(messages, period), source='the motion')
+                record = replace(from_messages(heard, period), source='the motion')
         yield record
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from backlash_ros import topics
 from backlash_ros.core.loop.command_history import REPORTED, without_origin
@@ -18,7 +17,7 @@ from backlash_ros.core.records.rows_to_record import Rows, on_grid, usable, with
 from backlash_ros.core.records.stamps import in_order
 from backlash_ros.tools.runs.read_run import choose_namespace, read_topics, topic_ends_like
 
-Messages = tuple[NDArray[np.int64], NDArray[np.float64]]  # stamps [ns] and values
+Messages = Sequence[tuple[int, float]]  # stamps [ns] and values
 
 FEWEST_MESSAGES = 3  # that are a motion
 ARRAY = 'std_msgs/msg/Float64MultiArray'
@@ -59,18 +58,12 @@ def read_bag_record(
         note, of_axis = f'v is {v}, y is {y}', ''
     else:
         heard, note = _native(signals, axis)
-        stamps = heard.get(topics.PLANT_OUTPUT, (np.empty(0),))[0]
+        stamps = [stamp for stamp, _ in heard.get(topics.PLANT_OUTPUT, ())]
         if len(stamps) < FEWEST_MESSAGES or np.median(stamps) < simulated_before_ns:
             return None
         of_axis = f' of axis {axis}' if axis else ''
     record = from_messages(heard, period, of_axis)
     return replace(record, notes=tuple(filter(None, (note, *record.notes, damage))))
-
-
-def as_messages(pairs: Sequence[tuple[int, float]]) -> Messages:
-    """From a stamp [ns] and a value each."""
-    stamps, values = zip(*pairs, strict=True)
-    return np.array(stamps, dtype=np.int64), np.array(values, dtype=float)
 
 
 def from_messages(heard: Mapping[str, Messages], period: float | None, of_axis: str = '') -> Record:
@@ -80,14 +73,13 @@ def from_messages(heard: Mapping[str, Messages], period: float | None, of_axis: 
     to sample, None tells it from the stamps. Raises RecordError.
     """
     said, notes = list[str](), list[str]()
-    begin_ns = int(np.median(heard[topics.PLANT_OUTPUT][0]))
-    sent = {}  # times [s] and values
-    for topic, (stamps, values) in heard.items():
-        pairs = np.array([(stamps - begin_ns) * 1e-9, values])
-        if len(stamps) >= FEWEST_MESSAGES and np.unique(pairs[0]).size > 1:
-            pairs = pairs[:, in_order(pairs[0], said, 'message')]
-        if len(stamps):
-            sent[topic] = pairs
+    begin_ns = int(np.median([stamp for stamp, _ in heard[topics.PLANT_OUTPUT]]))
+    sent = {topic: np.array([[(stamp - begin_ns) * 1e-9 for stamp, _ in messages],
+                             [value for _, value in messages]])
+            for topic, messages in heard.items() if messages}  # times [s] and values
+    for topic, pairs in sent.items():
+        if len(pairs[0]) >= FEWEST_MESSAGES and np.unique(pairs[0]).size > 1:
+            sent[topic] = pairs[:, in_order(pairs[0], said, 'message')]
     t, y = sent.pop(topics.PLANT_OUTPUT)
     commands, v = sent.get(topics.CONTROL), sent.get(topics.APPLIED_CONTROL)
     reported = v is not None and v.shape[1] >= REPORTED * len(t)
@@ -158,5 +150,5 @@ def _signals(path: Path) -> tuple[dict[str, Signal], str]:
             for part, joint, value in NUMBERS_OF[message.__msgtype__](message):
                 signal = topic.removeprefix('/') + part, is_command(topic), joint
                 series.setdefault(signal, []).append((stamp, float(value)))
-    return {name: Signal(as_messages(pairs), commanded, joint)
+    return {name: Signal(pairs, commanded, joint)
             for (name, commanded, joint), pairs in series.items()}, damage

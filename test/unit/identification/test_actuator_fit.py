@@ -97,11 +97,11 @@ def test_a_csv_keeps_the_commands_beside_v(tmp_path: Path) -> None:
 
 def test_messages_tell_commands_and_reports_of_each_interval() -> None:
     stamps = 10**18 + np.arange(50) * 5_000_000
-    reports = stamps - 100_000, np.arange(50.0)
+    reports = [(stamp - 100_000, k) for k, stamp in enumerate(stamps)]
     # The first command comes after five reports: until then the motor rests where it is.
-    control = stamps[5:] + 300_000, 100.0 + np.arange(5.0, 50.0)
+    control = [(stamp + 300_000, 100.0 + k) for k, stamp in enumerate(stamps)][5:]
     read = from_messages({
-        'plant_output': (stamps, np.zeros(50)), 'applied_control': reports, 'control': control,
-    }, PERIOD)
+        'plant_output': [(stamp, 0.0) for stamp in stamps], 'applied_control': reports,
+        'control': control}, PERIOD)
     assert read.v[:8].tolist() == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0]
     assert read.commands[:8].tolist() == [1.0, 1.0, 1.0, 1.0, 1.0, 105.0, 106.0, 107.0]
