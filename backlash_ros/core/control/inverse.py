@@ -10,10 +10,9 @@ from backlash_ros.core.plant.backlash import Region, clamp
 class BacklashInverse:
     """v = BI(u_d): crosses the gap whenever u_d turns; exact (2.2) with the true m, c_r, c_l.
 
-    direction_band: u_d has turned only when it came back from its extreme by more than this
-    [unit of u_d]; 0 is the printed inverse. take_up: largest move of v per sample while the gap is
-    crossed (2.3: "a line segment with a finite slope"), and over to a line that new estimates have
-    moved by more than that, until u moves [unit of v]; inf jumps.
+    direction_band: u_d has turned only when it came back from its extreme by more than this;
+    0 is the printed inverse. take_up: largest move of v per sample while the gap is crossed (2.3:
+    "a line segment with a finite slope"), and over to a line that new estimates have moved.
     """
 
     def __init__(self, direction_band: float = 0.0, take_up: float = inf) -> None:

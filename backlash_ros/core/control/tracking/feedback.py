@@ -1,9 +1,8 @@
 """Feedback that holds x on the ideal trajectory: K (x_hat - x*) + K_q (q - q*), within bounds.
 
-A deviation that noise explains is left alone: to feed it back would make v cross the gap for
-nothing. What is beyond is fed back as hard as the estimate of the backlash is trusted. The first
-one may be confidently wrong, which the samples after it contradict; so feedback hardens step by
-step as it holds, and softens while v does not follow.
+A deviation that noise explains is left alone. What is beyond is fed back as hard as the estimate of
+the backlash is trusted: the first one may be confidently wrong, which the samples after it
+contradict. So feedback hardens as it holds, and softens while v does not follow.
 """
 
 from __future__ import annotations
@@ -67,10 +66,9 @@ class DeviationNoise(NamedTuple):
 
 
 class StateFeedback:
-    """Gains of a design, used as far as the estimate is trusted.
+    """Gains of a design, used as far as the estimate is trusted; shrinkage: see Tracking.
 
-    While nothing is known the acquisition gain replaces K, and the trajectory itself excites the
-    backlash. shrinkage: standard deviations by which crossings are shrunk. noise_std: of y.
+    While nothing is known the acquisition gain replaces K, and the trajectory excites the backlash.
     """
 
     def __init__(self, design: TrackingDesign, shrinkage: float, noise_std: float) -> None:

@@ -136,9 +136,8 @@ class ReferenceWindow:
     """r(k) .. r(k + N) without the noise of y_m, and `history` references before them; preview: N.
 
     Each is replaced by the middle of a parabola through those around it, as many as are one but for
-    the noise; the newest N / 3 stay as they came. noise_gains: deviation of u* for noise of 1 that
-    was averaged so, shape (widths,). noise_spread: by how much noise parts low and high of the
-    window at most. u_noise_std: largest deviation of u* by what is left of the noise.
+    the noise; the newest N / 3 stay. noise_gains: deviation of u* for noise of 1 that was averaged
+    so, shape (widths,). u_noise_std: largest deviation of u* by what is left of the noise.
     """
 
     def __init__(self, preview: int, history: int, noise_gains: Array) -> None:
@@ -196,7 +195,7 @@ class ReferenceWindow:
         window = self.window
         self.low, self.high = float(window.min()), float(window.max())
         if std > 0.0:
-            self.noise_spread = 8.0 * std
+            self.noise_spread = 8.0 * std  # by as much it parts low and high at most
             first = self._end - self._preview - 1
             self.u_noise_gain = float(self._rows[2, first:max(self._end - half, first + 1)].max())
             self.u_noise_std = std * self.u_noise_gain

@@ -1,9 +1,8 @@
 """What v does while the reference rests: as little as keeps y where it belongs.
 
 Feedback through a gap that is not known to the last digit would limit-cycle. So v is held while y
-is within a tolerance of the trajectory, and otherwise moves in single steps (see `Mode`). Full
-feedback brings back all that is off, in as many moves as G has states, and one more; what is less
-it would leave to itself, as noise, until it is far away.
+is within a tolerance of the trajectory, and otherwise moves in single steps. Full feedback brings
+back all that is off; what is less it would leave to itself, as noise, until it is far away.
 """
 
 from __future__ import annotations
@@ -19,12 +18,10 @@ from backlash_ros.core.control.tracking.trajectory import TrajectoryState
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.plant.backlash import Region
 
-# v is held as long as |x - x*| is within so many standard deviations of the noise on y (StateModel
-# scales x so that |x| is the energy of the free response of y over some 50 samples: 7 stands for
-# an error of the size of the noise).
+# v is held as long as |x - x*|, the energy of the free response of y over some 50 samples, is
+# within so many standard deviations of the noise on y: 7 stands for an error of its size.
 TOLERANCE = 21.0
-# The same for the first samples of a rest, in which y is brought as close as the noise allows.
-# Later only a drift is worth a step.
+# The same for the first samples of a rest; later only a drift is worth a step.
 CLOSE, SETTLING = 7.0, 200
 UNCERTAIN = 5.0  # the same in standard deviations of x, where that is more
 # How often y may be brought back by full feedback, and gently until the tolerance is doubled each

@@ -2,8 +2,8 @@
 
     u*(k) = -K x*(k) - K_q q*(k) - sum f_j r(k+j),   x*(k+1) = A x* + B u*,   q*(k+1) = q* + r - y*
 
-It has the references ahead, so it says where u* goes within the next samples, and a turn of u* is
-seen before it comes. That decides on which side v is: once per turn, however noisy feedback is.
+A turn of u* is seen before it comes. That decides on which side v is: once per turn, however noisy
+feedback is.
 """
 
 from __future__ import annotations
@@ -188,10 +188,10 @@ class IdealTrajectory:
 def _turn(
     ahead: list[float], extreme: float, side: Region, noise: float, band: float, shortest: int,
 ) -> int | None:
-    """Where u* is furthest before it turns: samples from now on, -1 where that was before.
+    """Where u* is furthest before it turns: samples from now on, -1 where that was before; or None.
 
     It turns where it comes back by more than noise, and by more than the band as well, or for as
-    long as references are known; for more than the shortest time. None where it does not.
+    long as references are known; for more than the shortest time.
     """
     peak, furthest_back, turned = -1, 0.0, False
     for j, u in enumerate(ahead):
