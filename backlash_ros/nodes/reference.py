@@ -6,7 +6,10 @@ import sys
 import time
 from collections.abc import Mapping
 from functools import partial
+from math import inf
+from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
@@ -36,6 +39,7 @@ class ReferenceNode(ProcessNode):
         self._signal = build_reference(p)
         self._offset_s = 0.0  # keeps the phase where the frequency changes
         self._newest = 0  # sample that was published last
+        self._loop_runs_at = inf  # since then, as the controller tells [s]
         self._io = DriverIo(self, p)
         self._output = self.create_publisher(
             Float64, topics.REFERENCE, messages.KEPT_QOS if p.lockstep else messages.DEPTH
@@ -76,11 +80,27 @@ class ReferenceNode(ProcessNode):
                 pace.hear(counter.index, messages.arrival_ns(output.received_ns) * 1e-9)
 
         outputs = self._io.listen(hear, depth=1, polled=True)
+        diagnostics = self.listen(
+            DiagnosticArray, topics.DIAGNOSTICS, self._hear_diagnostics, 10, polled=True
+        ) if pace.waits else None
         serve_at = now
         while not self.stopping:
             if now >= serve_at:
                 executor.spin_once(timeout_sec=0.0)
                 serve_at = now + 0.05  # between two looks at signals and requests
+                if diagnostics is not None and pace.waits:
+                    serve_polled(diagnostics)
+                    # Fast DDS may miss a process of another machine for good that starts at the
+                    # same moment.
+                    if now > self._loop_runs_at + 0.5:
+                        pace.waits = False
+                        self.log.warning(
+                            f'{self._io.topics.output} is not heard here, but by the controller: '
+                            'y_m goes by the own clock; start the driver some seconds before'
+                        )
+                elif diagnostics is not None:
+                    self.destroy_subscription(diagnostics)
+                    diagnostics = None
             if pace.listens(now):
                 serve_polled(outputs)
                 now = time.monotonic()
@@ -91,6 +111,13 @@ class ReferenceNode(ProcessNode):
             wake_at = now + 0.05 * p.sample_period if pace.listens(now) else pace.look_s(now)
             time.sleep(max(min(wake_at, serve_at) - now, 0.0))
             now = time.monotonic()
+
+    def _hear_diagnostics(self, message: DiagnosticArray, info: dict[str, Any]) -> None:
+        """Note when the controller of this loop has used samples."""
+        loop = self.settings.io.joint or self.resolve_topic_name(self._io.topics.control)
+        if any(value.key == 'samples' and value.value != '0' for status in message.status
+               if status.hardware_id == loop for value in status.values):
+            self._loop_runs_at = min(self._loop_runs_at, time.monotonic())
 
     def check_change(self, p: Parameters) -> None:
         build_reference(p)

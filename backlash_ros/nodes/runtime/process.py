@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import ctypes
 import gc
@@ -28,7 +29,7 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from rclpy.utilities import remove_ros_args
 
-from backlash_ros.core.parameters import UNTOLD, ParameterError
+from backlash_ros.core.parameters import BY_NAME, UNTOLD, ParameterError, as_yaml
 from backlash_ros.middleware import prefer_loopback
 from backlash_ros.nodes.runtime.executor import Polled, PromptExecutor
 from backlash_ros.nodes.runtime.parameters import ParameterNode, complaints
@@ -139,7 +140,11 @@ def run(
                 executable, ': parameters are given as --ros-args -p NAME:=VALUE or --params-file '
                 'FILE', usage=f'{executable} [--ros-args -p NAME:=VALUE --params-file FILE ...]',
                 description=sys.modules[make_node.__module__].__doc__,
-                epilog='Parameters and what they mean: ros2 param list, ros2 param describe.',
+                formatter_class=argparse.RawDescriptionHelpFormatter,
+                epilog='parameters, with their defaults (* may change in a running node):'
+                + ''.join(f'\n{"* " if p.change == "live" else "  "}{p.name}: '
+                          f'{as_yaml(p.default)}\n      {p.description}'
+                          for p in BY_NAME.values() if executable in p.used_by),
             ).parse_args(remove_ros_args(arguments))
             node = make_node()
         except (ParameterError, NameValidationException) as error:
