@@ -4,8 +4,6 @@ Torn ones are read by the stream reader of mcap and the recovery of SQLite: neit
 or the metadata.yaml that only a bag that was closed has.
 """
 
-from __future__ import annotations
-
 import fcntl
 import os
 import shutil

@@ -3,8 +3,6 @@
 Each fault shows once. What a fault hides is not judged: amid lost samples nobody knows G(z).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import chain

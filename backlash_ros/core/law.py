@@ -1,7 +1,5 @@
 """What every law offers: estimates of the backlash, the state of G, and a report of its work."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import nan

@@ -1,7 +1,5 @@
 """What a whole record says, G being roughly known, by the fit of the loop over all its samples."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from math import inf, nan
 from typing import NamedTuple

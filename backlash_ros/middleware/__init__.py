@@ -5,8 +5,6 @@ and repeats lost messages after 3 s only. With loopback.xml they go by UDP over 
 there and in network.xml, where ROS_STATIC_PEERS take part, they are soon repeated.
 """
 
-from __future__ import annotations
-
 from collections.abc import MutableMapping
 from importlib.util import find_spec
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Node that judges a driver: it listens, moves it gently if told to, and says what does not fit."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 import tempfile

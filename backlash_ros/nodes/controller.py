@@ -1,7 +1,5 @@
 """Node that learns the backlash and cancels it: plant_output and reference in, control out."""
 
-from __future__ import annotations
-
 import sys
 import time
 from collections import deque

@@ -3,8 +3,6 @@
 As a process it is the part of `identify --drive` that moves an actuator, and records.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import time

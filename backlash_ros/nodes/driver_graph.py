@@ -1,7 +1,5 @@
 """What discovery tells of a driver: who publishes y, who listens to v, with which QoS."""
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 

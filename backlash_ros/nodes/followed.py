@@ -1,7 +1,5 @@
 """Controllers that run: found by what they publish, their state, their newest messages."""
 
-from __future__ import annotations
-
 import os
 import re
 import time

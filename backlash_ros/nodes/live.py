@@ -3,8 +3,6 @@
 The page is served to this machine alone, at an address that is printed.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 import time

@@ -3,8 +3,6 @@
 Without a terminal a line per controller is printed once a second.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import select

@@ -1,7 +1,5 @@
 """Node that simulates the plant: backlash, then G(z), then a sensor (3.1)."""
 
-from __future__ import annotations
-
 import sys
 import time
 from collections import Counter

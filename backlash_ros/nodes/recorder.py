@@ -1,7 +1,5 @@
 """Node that records all topics of the loop to a bag and tells how the run is going."""
 
-from __future__ import annotations
-
 import signal
 import sys
 import time

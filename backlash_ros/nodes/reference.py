@@ -1,7 +1,5 @@
 """Node that publishes the reference y_m."""
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Mapping

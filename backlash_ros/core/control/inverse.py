@@ -1,7 +1,5 @@
 """Backlash inverse, equations (2.2) and (2.3), with a direction band and a slow take-up."""
 
-from __future__ import annotations
-
 from math import inf, nan
 
 from backlash_ros.core.plant.backlash import Region, clamp

@@ -1,7 +1,5 @@
 """The last gate: every v that is sent has passed `Limits.apply`, those that end the loop too."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from math import floor, inf, isnan, sqrt

@@ -1,7 +1,5 @@
 """The structures of the papers: u_d = y_m + f v (3.2), and the four blocks of Tao and Kokotović."""
 
-from __future__ import annotations
-
 from math import hypot, inf
 
 import numpy as np

@@ -7,8 +7,6 @@ builds up while the contact winds up. So only samples count that come some time 
 what the backlash that was identified behind v says. All but the poles of L is linear.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from math import log
 

@@ -4,8 +4,6 @@ At several speeds, amplitudes and rests, in both directions: a lag shows as a ga
 the speed, and with one speed only, they could not be told apart.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from itertools import count
 from math import inf, pi, sin

@@ -5,8 +5,6 @@ exactly: what is compared depends on no G that was fitted with a play. What move
 by the residual of the fit. Tests return a sentence, empty where they find nothing.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property

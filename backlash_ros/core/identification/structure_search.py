@@ -9,8 +9,6 @@ good predictors; of these the least N' log(squares) + unknowns log(N') over all 
 (BIC), with N' = N (1 - r) / (1 + r) for the lag-1 correlation r of the residual.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from math import exp, inf, log, nan, sqrt

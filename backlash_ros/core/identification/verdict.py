@@ -3,8 +3,6 @@
 Everything is judged by numbers and signals; nothing here knows how the fit was made.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from math import log, nan
 from typing import NamedTuple

@@ -4,8 +4,6 @@ Repetitions, failed reads and lost turns are recognised where nothing else expla
 motion is predicted from its neighbours: what is left is noise, and wrong instants make it rough.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -5,8 +5,6 @@ true ones. Over these v, which holds, is averaged over each period, and y is mov
 where its noise hides the error of that; else the grid is finer, with nothing between the readings.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any, NamedTuple
 

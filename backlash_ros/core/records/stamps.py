@@ -1,7 +1,5 @@
 """Stamps of a log in seconds, and its rows in the order of time, without stamps that are none."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

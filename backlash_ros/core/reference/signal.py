@@ -1,7 +1,5 @@
 """Reference signals y_m(t), from a formula or from a file."""
 
-from __future__ import annotations
-
 import csv
 from math import asin, floor, isfinite, pi, sin
 from pathlib import Path

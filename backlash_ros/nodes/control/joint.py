@@ -1,7 +1,5 @@
 """One joint of the controller: its loop, what /diagnostics says of it, and what is kept."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor

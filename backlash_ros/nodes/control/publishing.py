@@ -1,7 +1,5 @@
 """What the controller publishes besides its commands: every step, single quantities, G(z)."""
 
-from __future__ import annotations
-
 import time
 from array import array
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Who else commands the same actuator, and which of them has to stand down."""
 
-from __future__ import annotations
-
 import hashlib
 import socket
 import time

@@ -1,7 +1,5 @@
 """What can be asked of a running controller: transitions of its life cycle, and its services."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any, cast
 

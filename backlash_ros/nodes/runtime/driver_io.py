@@ -1,7 +1,5 @@
 """What the driver says and is told, by joint, in the messages that io.style names."""
 
-from __future__ import annotations
-
 import time
 from array import array
 from collections.abc import Callable, Mapping, Sequence

@@ -3,8 +3,6 @@
 All that looks inside of rclpy, of the version of ROS 2 Jazzy, is in this file.
 """
 
-from __future__ import annotations
-
 import time
 from typing import Any
 

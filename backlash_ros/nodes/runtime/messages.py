@@ -5,8 +5,6 @@ sensor_msgs/JointState of six joints. Four bytes name the encoding, the second o
 lowest byte comes first. What follows is aligned to its size (CDR: DDS Interoperability, 10.2).
 """
 
-from __future__ import annotations
-
 import time
 from array import array
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Parameters of a node: declared from the one table, checked, changed while it runs."""
 
-from __future__ import annotations
-
 import difflib
 import re
 from collections.abc import Iterator, Mapping, Sequence

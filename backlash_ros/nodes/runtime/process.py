@@ -1,7 +1,5 @@
 """A node as a process: arguments, start-up, work, events, signals, shutdown, exit code."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import ctypes

@@ -1,7 +1,5 @@
 """`identify`: one command from a record, or from an actuator, to a checked parameter file."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import sys

@@ -1,7 +1,5 @@
 """`identify --drive`: lets a node move the actuator, and looks at the record as it grows."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import signal

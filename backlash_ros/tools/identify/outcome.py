@@ -1,7 +1,5 @@
 """From a measured record to the files of a result, the page, and what the terminal shows of it."""
 
-from __future__ import annotations
-
 import argparse
 import signal
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """The pictures of identify.html: a person judges by them whether the result is to be trusted."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

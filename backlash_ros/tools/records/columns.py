@@ -1,7 +1,5 @@
 """Which column is the time, which one the command v, which one the output y, by their names."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 

@@ -1,7 +1,5 @@
 """A record from messages of v and y: of a bag, or of an actuator that is being moved."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A record from whatever a user has: a table, a folder of results, a bag; or the same as a run."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """From G to the gains of the tracking structure: pure functions, fit for another process."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import lru_cache
 from math import inf

@@ -11,8 +11,6 @@ Reference: M. Tomizuka, Optimal continuous finite preview problem, IEEE Trans. A
 20 (1975) 362-365; A. Bemporad, lecture form of the affine Riccati recursion.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import NamedTuple
 

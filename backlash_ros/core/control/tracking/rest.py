@@ -5,8 +5,6 @@ is within a tolerance of the trajectory, and otherwise moves in single steps. Fu
 back all that is off; what is less it would leave to itself, as noise, until it is far away.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum, auto

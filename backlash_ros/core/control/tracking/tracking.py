@@ -1,7 +1,5 @@
 """The structure in which y follows y_m: an ideal trajectory and feedback that holds y on it."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

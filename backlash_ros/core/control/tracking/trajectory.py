@@ -6,8 +6,6 @@ A turn of u* is seen before it comes. That decides on which side v is: once per 
 feedback is.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from math import ceil, dist, isnan, nan
 
