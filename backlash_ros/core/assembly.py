@@ -88,10 +88,7 @@ def _build_law(p: Parameters, initial: Estimate, executor: Executor) -> Law:
         given = initial if initial.learned else replace(initial, c_r=0.0, c_l=0.0)
         observer = None if p.structure == 'proportional' \
             else FixedBacklash(given, model, noise_std, DOUBT)
-        return MovingHorizon(
-            initial, bounds, model, noise_std, options.input_noise_std, options.drift_std,
-            p.sample_period, p.plant.uncertainty, observer, executor,
-        )
+        return MovingHorizon(initial, bounds, model, p, observer, executor)
     if options.law == 'fixed':
         return FixedBacklash(initial, model, noise_std, p.fixed.doubt)
     # The others take c_l < 0 < c_r for granted, unless they are told otherwise.

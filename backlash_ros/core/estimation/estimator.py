@@ -60,25 +60,21 @@ def fitted(
 class MovingHorizon(Law):
     """Learns (m, c_r, c_l) and the error of G from y alone.
 
-    initial: a first guess, or with its deviations what was learned before. uncertainty: relative,
-    of the frequencies, damping and delay of G. walk_std, drift_std: random walks of u and of m,
-    c_r, c_l, per square root of a second. observer: gives the state of G until the backlash is
-    known, for structures that want it.
+    initial: a first guess, or with its deviations what was learned before. observer: gives the
+    state of G until the backlash is known, for structures that want it.
     """
 
     RETUNED = 'estimator.output_noise_std', 'estimator.input_noise_std', 'estimator.drift_std'
 
     def __init__(
-        self, initial: Estimate, bounds: Bounds, model: StateModel, noise_std: float,
-        walk_std: float, drift_std: tuple[float, float, float], sample_period: float,
-        uncertainty: float, observer: FixedBacklash | None = None,
-        executor: Executor | None = None,
+        self, initial: Estimate, bounds: Bounds, model: StateModel, p: Parameters,
+        observer: FixedBacklash | None = None, executor: Executor | None = None,
     ) -> None:
         self.estimate = replace(initial, status=Status.ACQUIRING)
-        family, root = PlantFamily(model.transfer_function, uncertainty), sample_period**0.5
-        self._setup = Setup(
-            family, max(noise_std, 1e-12), bounds, bounds.c_r[1] - bounds.c_l[0],
-            initial.c_r - initial.c_l, walk_std * root, np.array(drift_std) * root)
+        family = PlantFamily(model.transfer_function, p.plant.uncertainty)
+        self._setup = Setup(family, 0.0, bounds, bounds.c_r[1] - bounds.c_l[0],
+                            initial.c_r - initial.c_l, 0.0, np.zeros(3))
+        self.retune(p)
         self._channel = (executor or Executor()).open(3, settings.LONGEST + 16_384)
         self._belief = Belief()
         if initial.learned:
