@@ -18,15 +18,6 @@ from backlash_ros.tools.runs.read_run import choose_namespace, read_topics, topi
 Messages = Sequence[tuple[int, float]]  # stamps [ns] and values
 
 FEWEST_MESSAGES = 3  # that are a motion
-ARRAY = 'std_msgs/msg/Float64MultiArray'
-# What is added to the name of the topic, the joint, and the value of each number of a message.
-NUMBERS_OF: Mapping[str, Callable[[Any], Sequence[tuple[str, str, float]]]] = {
-    'std_msgs/msg/Float64': lambda message: [('', '', message.data)],
-    ARRAY: lambda message: [(f'[{k}]', '', value) for k, value in enumerate(message.data)],
-    'sensor_msgs/msg/JointState': lambda message: [
-        (f'/{joint}', joint, value)
-        for joint, value in zip(message.name, message.position, strict=False)],
-}
 
 
 class Signal(NamedTuple):
@@ -136,16 +127,26 @@ def _joint_pair(
 
 def _signals(path: Path) -> tuple[dict[str, Signal], str]:
     """Every number of a bag that may be v or y, by name, and what is wrong with the bag."""
+    array = 'std_msgs/msg/Float64MultiArray'
+    # What is added to the name of the topic, the joint, and the value of each number of a message.
+    numbers_of: Mapping[str, Callable[[Any], Sequence[tuple[str, str, float]]]] = {
+        'std_msgs/msg/Float64': lambda message: [('', '', message.data)],
+        array: lambda message: [(f'[{k}]', '', value) for k, value in enumerate(message.data)],
+        'sensor_msgs/msg/JointState': lambda message: [
+            (f'/{joint}', joint, value)
+            for joint, value in zip(message.name, message.position, strict=False)],
+    }
+
     def is_command(topic: str) -> bool:
         words = ('command', 'cmd', 'goal', 'target', 'setpoint')
         return any(word in topic.lower() for word in words)
 
-    recorded, _, damage = read_topics(path, lambda topic: topic.message_type in NUMBERS_OF and (
-        topic.message_type != ARRAY or is_command(topic.name)))
+    recorded, _, damage = read_topics(path, lambda topic: topic.message_type in numbers_of and (
+        topic.message_type != array or is_command(topic.name)))
     series: dict[tuple[str, bool, str], list[tuple[int, float]]] = {}
     for topic, messages in sorted(recorded.items()):
         for stamp, message in messages:
-            for part, joint, value in NUMBERS_OF[message.__msgtype__](message):
+            for part, joint, value in numbers_of[message.__msgtype__](message):
                 signal = topic.removeprefix('/') + part, is_command(topic), joint
                 series.setdefault(signal, []).append((stamp, float(value)))
     return {name: Signal(pairs, commanded, joint)
