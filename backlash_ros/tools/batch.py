@@ -6,11 +6,9 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Generator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, CancelledError, ProcessPoolExecutor, wait
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import CancelledError, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing
-from importlib.metadata import version
 from math import inf
 from typing import NamedTuple
 
@@ -39,7 +37,6 @@ OUTCOME_COLUMNS = (
 # What a run came to, under OUTCOME_COLUMNS: nothing where a number is unknown or never reached;
 # problem: why it broke off, '' where it did not.
 Outcome = Mapping[str, float | str | None]
-Finished = Generator[tuple[int, Outcome], None, None]  # number of a job, what it came to
 
 
 class Job(NamedTuple):
@@ -117,15 +114,11 @@ def run_jobs(
     """
     workers = min(workers or len(os.sched_getaffinity(0)), len(jobs))
     finished = _on_cluster(jobs, cluster) if cluster is not None else \
-        _in_processes(jobs, workers) if workers > 1 else \
-        ((i, run_job(job)) for i, job in enumerate(jobs))
-    with closing(finished), \
-            tqdm(finished, desc=label, total=len(jobs), unit='run', disable=None) as bar:
-        outcomes = dict(bar)
-    return [outcomes[i] for i in range(len(jobs))]
+        _in_processes(jobs, workers) if workers > 1 else map(run_job, jobs)
+    return list(tqdm(finished, desc=label, total=len(jobs), unit='run', disable=None))
 
 
-def _in_processes(jobs: Sequence[Job], workers: int) -> Finished:
+def _in_processes(jobs: Sequence[Job], workers: int) -> Iterator[Outcome]:
     os.environ.update(cli.ONE_THREAD)  # read when a worker imports numpy
     executor = ProcessPoolExecutor(
         workers, multiprocessing.get_context('spawn'), initializer=_end_with_parent)
@@ -135,16 +128,15 @@ def _in_processes(jobs: Sequence[Job], workers: int) -> Finished:
         with cli.StopRequests() as held:
             # Workers inherit for good what is blocked: a Ctrl-C is for their parent alone.
             signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
-            numbers = {executor.submit(run_job, job): i for i, job in enumerate(jobs)}
+            futures = [executor.submit(run_job, job) for job in jobs]
             signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
         if held.count:
             raise KeyboardInterrupt
-        pending = set(numbers)
-        while pending:
+        for future in futures:
             # A signal that comes just before a wait is only noticed after it: none is without end.
-            done, pending = wait(pending, 0.5, FIRST_COMPLETED)
-            for future in done:
-                yield numbers[future], future.result()
+            while not wait([future], 0.5).done:
+                pass
+            yield future.result()
     except BrokenProcessPool:
         raise BrokenOffError('a worker process was killed: is there enough memory?') from None
     finally:
@@ -164,46 +156,30 @@ def _end_with_parent() -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def _on_cluster(jobs: Sequence[Job], address: str) -> Finished:
+def _on_cluster(jobs: Sequence[Job], address: str) -> Iterator[Outcome]:
     """A run whose worker is lost is given to another one. address: as tcp://HOST:PORT."""
     try:
-        from distributed import Client, KilledWorker
-        from distributed import TimeoutError as NoAnswerError
-        from distributed import as_completed as completed
+        from distributed import Client, KilledWorker, TimeoutError
     except ImportError:
         raise InputError(
             "--cluster needs Dask, which is not installed: pip install 'backlash_ros[cluster]'"
         ) from None
     logging.getLogger('distributed').setLevel(logging.CRITICAL)
-    here, there = libraries(), f'--cluster {address}'
     try:
         with Client(address, timeout=CLUSTER_ANSWER_S, set_as_default=False) as client:
             client.wait_for_workers(1, timeout=CLUSTER_ANSWER_S)
-            for worker, found in client.run(libraries).items():
-                if found != here:
-                    raise InputError(f'{there}: {worker} has {found}, here is {here}: install the '
-                                     'same versions, else the last digits differ')
             # Not pure: runs of the same parameters are runs all the same.
-            futures = client.map(run_job, jobs, pure=False)
-            numbers = {future.key: i for i, future in enumerate(futures)}
-            for future, outcome in completed(futures, loop=client.loop, with_results=True):
-                yield numbers[future.key], outcome
-    except InputError:
-        raise
+            for future in client.map(run_job, jobs, pure=False):
+                yield future.result()
     except (KilledWorker, CancelledError):
-        raise BrokenOffError(f'{there}: a run has ended several workers, or the scheduler has '
-                             'ended: is there enough memory?') from None
-    except (OSError, ValueError, ImportError, NoAnswerError) as error:
+        raise BrokenOffError(f'--cluster {address}: a run has ended several workers, or the '
+                             'scheduler has ended: is there enough memory?') from None
+    except (OSError, ValueError, ImportError, TimeoutError) as error:
         reason = ' '.join(str(error).split()) or type(error).__name__
         raise InputError(
-            f'{there}: {reason}: start a scheduler with `dask scheduler --host HOST`, and workers '
-            'that have this backlash_ros with `dask worker tcp://HOST:8786`'
+            f'--cluster {address}: {reason}: start a scheduler with `dask scheduler --host HOST`, '
+            'and workers that have this backlash_ros with `dask worker tcp://HOST:8786`'
         ) from None
-
-
-def libraries() -> dict[str, str]:
-    """Versions of the libraries on which the last bit of a result may depend."""
-    return {name: version(name) for name in ('numpy', 'scipy')}
 
 
 def statistics(outcomes: Sequence[Outcome]) -> dict[str, ParameterStatistics]:
