@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.plant.backlash import Backlash
 from backlash_ros.core.simulation.run_record import SETTLING_TOLERANCE, RunRecord
+from backlash_ros.tools.cli import number
 from backlash_ros.tools.runs.summary import ErrorCurves, Part
 from backlash_ros.topics import BACKLASH
 
@@ -55,20 +56,12 @@ def label(axes: Axes, title: str = '', y: str = '', x: str = '') -> None:
 
 def legend_above(axes: Axes) -> None:
     """Put the legend in one row above the axes, at the right, beside the title."""
-    axes.legend(loc='lower right', bbox_to_anchor=(1.0, 1.0), ncol=9, borderaxespad=0.1,
-                handlelength=2.2, columnspacing=1.4)
+    axes.legend(loc='lower right', bbox_to_anchor=(1.0, 1.0), ncol=9, borderaxespad=0.1)
 
 
-def legend_below(figure: Figure, axes: Axes, columns: int = 4) -> None:
+def legend_below(figure: Figure, axes: Axes) -> None:
     """Put the legend of axes below all axes of the figure."""
-    figure.legend(*axes.get_legend_handles_labels(), loc='outside lower center', ncol=columns)
-
-
-def limit_decades(axes: Axes, lowest: float, highest: float) -> None:
-    """Make y logarithmic over at most 8 decades: what is below them is as good as zero."""
-    axes.set_yscale('log')
-    if 0.0 < highest < np.inf:
-        axes.set_ylim(max(lowest, highest * 1e-8) * 0.6, highest * 1.7)
+    figure.legend(*axes.get_legend_handles_labels(), loc='outside lower center', ncol=3)
 
 
 def curve(
@@ -93,9 +86,8 @@ def band(axes: Axes, t: Array, low: Array, high: Array, colour: str, name: str =
 
 def shade(axes: Axes, t: Array, where: NDArray[np.bool_], name: str) -> None:
     """Shade the times for which `where` holds."""
-    if where.any():
-        axes.fill_between(t, 0, 1, where=where.tolist(), transform=axes.get_xaxis_transform(),
-                          step='post', color='#bbbbbb', alpha=0.4, linewidth=0, label=name)
+    axes.fill_between(t, 0, 1, where=where.tolist(), transform=axes.get_xaxis_transform(),
+                      step='post', color='#bbbbbb', alpha=0.4, linewidth=0, label=name)
 
 
 def limits(values: Sequence[Array], margin: float) -> tuple[float, float]:
@@ -122,7 +114,8 @@ def draw_panels(
         for axes, (name, lines) in zip(column, rows.items(), strict=True):
             label(axes, y=name if part is parts[0] else '')
             for t, values, *look in lines:
-                curve(axes, t[part.rows], values[part.rows], *look)
+                if np.isfinite(values).any():
+                    curve(axes, t[part.rows], values[part.rows], *look)
             if frozen_in is not None:
                 frozen = frozen_in.column('status')[part.rows] >= float(Status.NOT_EXCITED)
                 shade(axes, frozen_in.column('t')[part.rows], frozen, 'frozen')
@@ -141,24 +134,20 @@ def draw_parameter_errors(
         error, unit = truth - run.column(name), BACKLASH_UNITS[name].removeprefix('unit of ')
         errors.append((t, error, hue, f'${name} - {HATS[name]}$ [{unit}]', style, 1.8))
         # Nothing is a percentage of zero, and the logarithm has no zero.
-        size = np.maximum(100.0 * np.abs(error / np.where(truth == 0.0, np.nan, truth)), 1e-300)
+        size = np.maximum(100.0 * np.abs(error / np.where(truth == 0.0, np.nan, truth)), 1e-6)
         percents.append((t, size, hue, '', style, 1.5))
     figure, grid = draw_panels(7.4, {
         'true minus estimated': errors, 'size of the error [% of the true value]': percents,
     }, parts, run, sharey='row')
-    for (absolute, relative), (_, rows) in zip(grid.T, parts, strict=True):
-        for name, (_, error, *_) in zip(BACKLASH, errors, strict=True):
-            std, settled = 2 * run.column(f'std_{name}'), settling[name]
-            band(absolute, t[rows], (error - std)[rows], (error + std)[rows], HUES[name])
-            if settled is not None and settled <= t[rows][-1]:
-                relative.plot(settled, tolerance, 'o', color=HUES[name], markersize=7,
-                              markeredgecolor='white', zorder=5)
+    for absolute, relative in grid.T:
+        for name in BACKLASH:
+            if settling[name] is not None:
+                relative.plot(settling[name], tolerance, 'o', color=HUES[name])
         zero_line(absolute)
         absolute.set_ylim(*limits([error for _, error, *_ in errors], margin=0.08))
         relative.axhline(tolerance, color='#444444', linewidth=0.9, linestyle=':')
-        known = np.concatenate([size[rows] for _, size, *_ in percents])
-        known = known[np.isfinite(known)]
-        limit_decades(relative, known.min(initial=0.5), known.max(initial=2.0))
+        relative.set_yscale('log')
+    grid[0, 0].set_xlim(*limits([t[start.rows]], margin=0.05))
     legend_below(figure, grid[0, 1])
     return figure
 
@@ -169,25 +158,21 @@ def draw_estimates(run: RunRecord, recorded: RunRecord | None = None) -> Figure:
     recorded: of a replay, the run whose estimates, innovation and status are shown instead of it.
     """
     t, names = run.column('t'), {f'${HATS[n]}$ [{BACKLASH_UNITS[n]}]': n for n in BACKLASH}
-    beside, known, prefix, wide, own = run, run.has_truth, 'true_', 'true', 'estimated'
+    beside, prefix, wide, own = run, 'true_', 'true', 'estimated'
     if recorded is not None:
         names |= {'innovation [y]': 'innovation', 'status': 'status'}
         beside, prefix, wide, own = recorded, '', 'run', 'replay'
-        known = bool(np.isfinite(recorded.column('m')[-1]))
     figure, grid = draw_panels(1.0 + 2.0 * len(names), {text: [
-        *[(t, beside.column(f'{prefix}{name}'), HUES['true'], wide, '-', 6.0, 0.22)] * known,
+        (t, beside.column(f'{prefix}{name}'), HUES['true'], wide, '-', 6.0, 0.22),
         (t, run.column(name), HUES.get(name, HUES['e']), own, '-', 1.8),
     ] for text, name in names.items()}, frozen_in=run)
     for axes, name in zip(grid[:, 0], BACKLASH, strict=False):
         estimate, std = run.column(name), 2 * run.column(f'std_{name}')
-        title = f'${HATS[name]}$ = {estimate[-1]:.6g}'
-        if np.isfinite(std).any():
-            band(axes, t, estimate - std, estimate + std, HUES[name], '±2 standard deviations')
-            # The first, nearly boundless uncertainty would flatten everything else: the limits
-            # are those of the curves, with a margin for the deviations.
-            axes.set_ylim(*limits([estimate, beside.column(f'{prefix}{name}')], 0.25))
-            title += f' ± {std[-1]:.2g}'
-        label(axes, f'{title} at the end')
+        band(axes, t, estimate - std, estimate + std, HUES[name], '±2 standard deviations')
+        # The first, nearly boundless uncertainty would flatten everything else: the limits are
+        # those of the curves, with a margin for the deviations.
+        axes.set_ylim(*limits([estimate, beside.column(f'{prefix}{name}')], 0.25))
+        label(axes, f'${HATS[name]}$ = {estimate[-1]:.6g} ± {number(std[-1], 2)} at the end')
         legend_above(axes)
     if recorded is not None:
         grid[-1, 0].set_yticks([int(state) for state in Status], [state.word for state in Status])
@@ -196,20 +181,15 @@ def draw_estimates(run: RunRecord, recorded: RunRecord | None = None) -> Figure:
 
 def draw_closer(run: RunRecord, values: Array, name: str, parts: Sequence[Part]) -> Figure:
     """A signal over the whole run, and beside it closer over each part."""
-    figure, grid = draw_panels(
-        3.6, {name: [(run.column('t'), values, HUES['e'])]}, (WHOLE_RUN, *parts), run,
-        width_ratios=[2.0, *(1.0 for _ in parts)],
-    )
-    for axes in grid[0]:
-        zero_line(axes)
-    return figure
+    return draw_panels(
+        3.6, {name: [(run.column('t'), values, HUES['e'])]}, (WHOLE_RUN, *parts), run)[0]
 
 
 def draw_hysteresis(run: RunRecord, end: Part) -> Figure:
     """v-u loop at the end of the run with the true and the estimated lines."""
     figure = new_figure(6.0)
     axes = figure.subplots()
-    t, v, truth = run.column('t')[end.rows], run.column('v'), run.has_truth
+    v, truth = run.column('v'), run.has_truth
     m, c_r, c_l = (float(run.column(name)[-1]) for name in BACKLASH)
     u = run.column('u') if truth else m * (v - c_r)
     if not truth and c_l < c_r:
@@ -223,13 +203,12 @@ def draw_hysteresis(run: RunRecord, end: Part) -> Figure:
                   f'true {side} line\n$m(v - {name})$', width=6.0, alpha=0.35)
         curve(axes, span, m * (span - c), HUES[name],
               f'estimated {side} line\n${HATS["m"]}(v - {HATS[name]})$', '--', 1.6)
-    axes.plot(v, u, color='#999999', linewidth=0.8, zorder=1, label='earlier')
-    axes.plot(v[end.rows], u[end.rows], color=HUES['u'], linewidth=1.1, marker='.',
-              markersize=3, label=f'samples from\n{t[0]:.4g} s to {t[-1]:.4g} s')
+    curve(axes, v, u, '#999999', 'earlier', width=0.8)
+    curve(axes, v[end.rows], u[end.rows], HUES['u'], 'at the end')
     axes.set(xlim=span, ylim=limits([u[end.rows]], margin=0.25))
     label(axes, 'u = B[v]' if truth else 'u = B[v] as the last estimates see it',
           'u [unit of u]', 'control v [unit of v]')
-    axes.legend(loc='upper left', bbox_to_anchor=(1.01, 1.0), labelspacing=1.0)
+    axes.legend(loc='upper left', bbox_to_anchor=(1.01, 1.0))
     return figure
 
 
@@ -244,19 +223,17 @@ def draw_output(run: RunRecord, end: Part, y_m: Array, delay: float, followed: b
     } if followed else {
         f'reference $y_m$ [unit of $y_m$]{late}': [reference], 'output y [unit of y]': [output],
     }, (WHOLE_RUN, end))
-    for axes in grid[0] if followed else ():
-        legend_above(axes)
+    if followed:
+        legend_above(grid[0, 1])
     return figure
 
 
 def draw_input(run: RunRecord, parts: Sequence[Part]) -> Figure:
     """Desired and true input of G, and the control v that causes it."""
-    t, u, hue = run.column('t'), run.column('u'), HUES['u_d']
-    known = bool(np.isfinite(u).any())
+    t = run.column('t')
     figure, grid = draw_panels(5.6, {
-        'input of G [unit of u]': [
-            *[(t, u, HUES['u'], 'u', '-', 1.6)] * known,
-            (t, run.column('u_d'), hue, '$u_d$', '--' if known else '-', 1.6)],
+        'input of G [unit of u]': [(t, run.column('u'), HUES['u'], 'u', '-', 1.6),
+                                   (t, run.column('u_d'), HUES['u_d'], '$u_d$', '--', 1.6)],
         'control v [unit of v]': [(t, run.column('v'), HUES['v'])],
     }, parts)
     legend_above(grid[0, -1])
@@ -280,13 +257,14 @@ def draw_error_curves(loops: Sequence[ErrorCurves], window_s: float) -> Figure:
     figure, grid = draw_panels(4.2 * len(rows), rows)
     for axes, lines in zip(grid[:, 0], rows.values(), strict=True):
         known = [size[np.isfinite(size) & (size > 0.0)] for _, size, *_ in lines]
+        axes.set_yscale('log')
         if highest := [float(size.max()) for size in known if size.size]:
-            # Not the least of all, as an error begins at zero; a law that diverges leaves the axes.
-            low = float(np.percentile(np.concatenate(known), 2))
-            limit_decades(axes, low, min(max(highest), 1e3 * float(np.median(highest))))
+            # An error begins at zero; a law that diverges leaves the axes.
+            low, high = np.percentile(np.concatenate(known), 2), 1e3 * np.median(highest)
+            axes.set_ylim(0.6 * float(low), 1.7 * min(max(highest), float(high)))
     label(grid[0, 0], 'Control error')
     label(grid[-1, 0], 'Tracking error, where y is meant to follow' if len(rows) > 1 else '')
-    legend_below(figure, grid[0, 0], columns=3)
+    legend_below(figure, grid[0, 0])
     return figure
 
 

@@ -6,7 +6,6 @@ supervisor dies, a pipe closes, and this module as a program, the guardian, stop
 
 import json
 import os
-import selectors
 import signal
 import socket
 import subprocess
@@ -17,6 +16,8 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
+from queue import Empty, SimpleQueue
+from threading import Thread
 from typing import Any
 
 import backlash_ros
@@ -25,7 +26,7 @@ from backlash_ros.tools.cli import ONE_THREAD, BrokenOffError
 
 # SIGINT lets a node end as by Ctrl-C; a recorder may need a while to close a large bag.
 ESCALATION = ((signal.SIGINT, 10.0), (signal.SIGTERM, 3.0), (signal.SIGKILL, 3.0))
-Events = list[tuple[Any, dict[str, Any]]]  # of a child each
+Events = list[tuple['Child', dict[str, Any]]]
 
 
 def child_environment(log_folder: Path, domain: int | None) -> dict[str, str]:
@@ -65,10 +66,9 @@ def free_domain() -> Iterator[int]:
     Domain d has the UDP ports from 7400 + 250 d on, of which participant n takes 10 + 2 n and
     11 + 2 n (RTPS 2.5, 9.6.2); a port that no participant ever uses reserves it.
     """
-    domains = 101  # those that lie below the ports that Linux hands out to others
-    # Starting at the process id spreads runs that start at the same moment.
-    for i in range(domains):
-        domain = 1 + (os.getpid() + i) % domains
+    # These lie below the ports that Linux hands out to others. Starting at the process id spreads
+    # runs that start at the same moment.
+    for domain in (1 + (os.getpid() + i) % 101 for i in range(101)):
         port = 7400 + 250 * domain
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as reservation:
             try:
@@ -82,8 +82,7 @@ def free_domain() -> Iterator[int]:
             yield domain
             return
     raise BrokenOffError(
-        f'every ROS_DOMAIN_ID from 1 to {domains} is in use on this machine: set one yourself'
-    )
+        'every ROS_DOMAIN_ID from 1 to 101 is in use on this machine: set one yourself')
 
 
 @dataclass(eq=False)
@@ -105,7 +104,6 @@ class Child:
     settle_s: float = 0.0
     grace_s: float = 0.0
     process: subprocess.Popen[bytes] = field(init=False)
-    unfinished: bytes = field(default=b'', init=False)
 
     def start(self) -> None:
         """Raises BrokenOffError for a program that cannot be started."""
@@ -126,19 +124,18 @@ class Child:
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
-    def events(self, chunk: bytes) -> list[dict[str, Any]]:
-        """JSON objects with `event` in the lines that end in this chunk; all else is logged."""
-        *lines, self.unfinished = (self.unfinished + chunk).split(b'\n')
-        found = []
-        for line in lines:
-            with suppress(ValueError):
-                content = json.loads(line)
-                if isinstance(content, dict) and 'event' in content:
-                    found.append(content)
-                    continue
-            with self.log.open('ab') as log:
-                log.write(line + b'\n')
-        return found
+    def pass_on(self, events: 'SimpleQueue[tuple[Child, dict[str, Any]]]') -> None:
+        """Read its output to the end; JSON objects with `event` are passed on, all else is logged.
+        """
+        assert self.process.stdout is not None
+        with self.process.stdout as lines, self.log.open('ab', 0) as log:
+            for line in lines:
+                with suppress(ValueError):
+                    content = json.loads(line)
+                    if isinstance(content, dict) and 'event' in content:
+                        events.put((self, content))
+                        continue
+                log.write(line)
 
     def describe_end(self, what: str, further: str = '') -> str:
         """What became of it, how it exited, and the end of its log."""
@@ -162,7 +159,8 @@ class ProcessSupervisor:
     def __init__(self, stages: Sequence[Sequence[Child]], hurry: Callable[[], bool]) -> None:
         self._stages, self._hurry = stages, hurry
         self.children: list[Child] = []
-        self._selector = selectors.DefaultSelector()
+        self._readers: list[Thread] = []
+        self._events = SimpleQueue[tuple[Child, dict[str, Any]]]()
 
     def __enter__(self) -> 'ProcessSupervisor':
         self._guardian = subprocess.Popen(
@@ -177,8 +175,10 @@ class ProcessSupervisor:
                 self.children.append(child)
                 with suppress(BrokenPipeError):
                     self._guardian.stdin.write(f'{json.dumps(self._to_stop())}\n'.encode())
-                if child.process.stdout is not None:
-                    self._selector.register(child.process.stdout, selectors.EVENT_READ, child)
+                if not child.foreign:
+                    self._readers.append(Thread(
+                        target=child.pass_on, args=(self._events,), daemon=True))
+                    self._readers[-1].start()
         except BaseException:
             self.__exit__()
             raise
@@ -186,32 +186,26 @@ class ProcessSupervisor:
 
     def __exit__(self, *error: object) -> None:
         self.stop()
-        self._selector.close()
-        for child in self.children:
-            if child.process.stdout is not None:
-                child.process.stdout.close()
         self._guardian.communicate(b'[]\n')
 
     def events(self, timeout: float) -> Events:
         """What the processes have said; waits up to timeout [s] for a first word."""
         found: Events = []
-        for key, _ in self._selector.select(timeout):
-            chunk = os.read(key.fd, 65536)
-            if not chunk:
-                self._selector.unregister(key.fileobj)
-            found += [(key.data, content) for content in key.data.events(chunk)]
+        with suppress(Empty):
+            found.append(self._events.get(timeout=timeout))
+            while True:
+                found.append(self._events.get_nowait())
         return found
 
     def stop(self) -> Events:
         """Stop one stage after the other, each child with all its group; returns last words."""
-        last_words: Events = []
         for stage in self._to_stop():
-            stop_groups(*stage, lambda: last_words.extend(self.events(0.02)), self._hurry)
+            stop_groups(*stage, self._hurry)
         for child in self.children:
             child.process.poll()
-        while self._selector.select(0.0):
-            last_words += self.events(0.0)
-        return last_words
+        for reader in self._readers:
+            reader.join(1.0)  # whoever left the group may keep the output open
+        return self.events(0.0)
 
     def _to_stop(self) -> list[tuple[list[int], float, float]]:
         """Of each stage its process groups, and the longest settle_s and grace_s."""
@@ -223,8 +217,7 @@ class ProcessSupervisor:
 
 
 def stop_groups(
-    groups: Sequence[int], settle_s: float, grace_s: float, wait: Callable[[], None],
-    hurry: Callable[[], bool],
+    groups: Sequence[int], settle_s: float, grace_s: float, hurry: Callable[[], bool],
 ) -> None:
     """Signal process groups, ever more firmly, until none is alive or all means are used up.
 
@@ -239,7 +232,7 @@ def stop_groups(
                 with suppress(ProcessLookupError, PermissionError):
                     os.killpg(group, number)
         while (last or not hurry()) and time.monotonic() < deadline and living(groups):
-            wait()
+            time.sleep(0.02)
 
 
 def living(groups: Sequence[int]) -> set[int]:
@@ -264,7 +257,7 @@ def guard(lines: Iterable[str]) -> None:
     for line in lines:
         stages = json.loads(line)
     for stage in stages:
-        stop_groups(*stage, lambda: time.sleep(0.02), lambda: False)
+        stop_groups(*stage, lambda: False)
 
 
 if __name__ == '__main__':

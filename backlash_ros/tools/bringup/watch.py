@@ -12,7 +12,7 @@ from typing import Any
 
 from backlash_ros import topics
 from backlash_ros.tools.bringup.plan import ELSEWHERE, AxisPlan, RunPlan, plan_processes
-from backlash_ros.tools.bringup.supervisor import Child, ProcessSupervisor, free_domain
+from backlash_ros.tools.bringup.supervisor import Events, ProcessSupervisor, free_domain
 from backlash_ros.tools.cli import BrokenOffError, InputError, StopRequests, number
 from backlash_ros.tools.runs.files import BAG
 
@@ -55,7 +55,6 @@ class AxisProgress:
 
     @property
     def unheard(self) -> dict[str, int]:
-        """What is missing of the published ones."""
         return Counter(self.published or {}) - Counter(self.heard)
 
     def begin(self) -> None:
@@ -75,19 +74,20 @@ class AxisProgress:
         if self.moved >= self.next_line:
             # Every 2 s, and ever more seldom, so that a run of days does not fill the disk.
             self.next_line = self.moved + max(2.0, 0.05 * (self.moved - self.began))
-            count = f'{made}/{p.samples}' if p.samples else f'{made}'
-            words = [f'{made * p.sample_period:7.2f} s', count, *(
+            words = [f'{made * p.sample_period:7.2f} s', f'{made}/{p.samples or "∞"}', *(
                 f'{name} {number(progress.get(name))}' for name in topics.BACKLASH
             ), f'lost {progress.get("lost", 0)}']
             complain(self.plan.titled('  '.join(words)), '')
 
     def check_pace(self) -> None:
         """Raise BrokenOffError for samples that do not come."""
-        now, plan, p, failure = time.monotonic(), self.plan, self.plan.parameters, ''
-        if self.complete:
+        now, p, failure = time.monotonic(), self.plan.parameters, ''
+        at = f' after sample {self.first + self.made - 1}' if self.made else ''
+        silence = f'no new sample for {self.patience:g} s{at}'
+        if self.complete or (p.driver == ELSEWHERE and self.made == 0):
             return
         if p.driver and self.made == 0:
-            if p.driver != ELSEWHERE and now > self.began + START_DEADLINE_S:
+            if now > self.began + START_DEADLINE_S:
                 failure = (f'no sample within {START_DEADLINE_S:g} s: does the driver publish its '
                            'output? Where it needs longer, start it yourself (--driver none)')
         elif p.samples and not p.lockstep and \
@@ -95,16 +95,14 @@ class AxisProgress:
             failure = (f'only {self.made} of {p.samples} samples, {LATE_DEADLINE_S:g} s after the '
                        'end was due')
         elif now > self.moved + self.patience:
-            at = f' after sample {self.first + self.made - 1}' if self.made else ''
-            silence = f'no new sample for {self.patience:g} s{at}'
             # The controller knows what to do when a real plant falls silent.
             if not p.driver:
                 failure = silence
             elif not self.silent:
                 self.silent = True
-                complain(plan.titled(f'{silence}, waiting for the driver'))
+                complain(self.plan.titled(f'{silence}, waiting for the driver'))
         if failure:
-            raise BrokenOffError(plan.titled(f'{failure}, see {plan.logs}'))
+            raise BrokenOffError(self.plan.titled(f'{failure}, see {self.plan.logs}'))
 
 
 class RunWatch:
@@ -136,25 +134,18 @@ class RunWatch:
             deadline = time.monotonic() + 10.0
             while not self._over and time.monotonic() < deadline and any(a.unheard for a in axes):
                 self._listen()
-            for axis in axes:
-                if axis.unheard:
-                    missing = ', '.join(f'{count} {what}' for what, count in axis.unheard.items())
-                    complain(axis.plan.titled(
-                        f'the plant has published more than the recorder heard: {missing}'))
             if self._over:
                 complain(f'{self._requests.last} ends the run')
         except BrokenOffError as error:
             # Said before the processes are stopped, which may take a while.
             self._fail(str(error))
-        for child, content in self._supervisor.stop():
-            self._note(child, content)
-        if not self.failure:
-            for child in self._supervisor.children:
-                code = child.process.returncode
-                # How a program of the user says good-bye is its own affair.
-                if code and child.name not in self._gone and (
-                        not child.foreign or code == -signal.SIGKILL):
-                    self._fail(child.describe_end('did not stop cleanly'))
+        self._note(self._supervisor.stop())
+        for child in self._supervisor.children if not self.failure else ():
+            code = child.process.returncode
+            # How a program of the user says good-bye is its own affair.
+            if code and child.name not in self._gone and (
+                    not child.foreign or code == -signal.SIGKILL):
+                self._fail(child.describe_end('did not stop cleanly'))
 
     def _fail(self, failure: str) -> None:
         self.failure = failure
@@ -171,9 +162,7 @@ class RunWatch:
         deadline = time.monotonic() + START_DEADLINE_S
         while missing := [child for child in self._supervisor.children
                           if not child.foreign and child.name not in self._ready]:
-            self._listen()
-            late = [child for child in missing if child.name not in self._ready
-                    and not self.axes[child.axis].plan.waits]
+            late = [child for child in missing if not self.axes[child.axis].plan.waits]
             if late and time.monotonic() > deadline:
                 hint = ' (a controller waits until the driver subscribes to its command)' \
                     if any(axis.plan.parameters.driver for axis in self.axes.values()) else ''
@@ -182,10 +171,10 @@ class RunWatch:
                     f'{", ".join(child.name for child in late)}{hint}',
                     *(f'the end of {child.end_of_log()}' for child in late),
                 ]))
+            self._listen()
 
     def _listen(self) -> None:
-        for child, content in self._supervisor.events(0.1):
-            self._note(child, content)
+        self._note(self._supervisor.events(0.1))
         if self._requests.count and not self._over:
             raise BrokenOffError(f'interrupted by {self._requests.last}, stopping')
         dead = []
@@ -200,19 +189,20 @@ class RunWatch:
         if dead:
             raise BrokenOffError('\n'.join(dead))
 
-    def _note(self, child: Child, content: Mapping[str, Any]) -> None:
-        axis, kind = self.axes[child.axis], content['event']
-        if kind == 'ready':
-            self._ready.add(child.name)
-            if 'address' in content:
-                print(f'{child.name}: {content["address"]}', flush=True)
-        elif kind == 'done':
-            axis.published = content['published']
-        elif kind == 'progress':
-            axis.take(content)
-        elif kind == 'complaint':
-            # The log may lie on the very disk that is full.
-            complain(axis.plan.titled(content['text']))
+    def _note(self, events: Events) -> None:
+        for child, content in events:
+            axis, kind = self.axes[child.axis], content['event']
+            if kind == 'ready':
+                self._ready.add(child.name)
+                if 'address' in content:
+                    print(f'{child.name}: {content["address"]}', flush=True)
+            elif kind == 'done':
+                axis.published = content['published']
+            elif kind == 'progress':
+                axis.take(content)
+            elif kind == 'complaint':
+                # The log may lie on the very disk that is full.
+                complain(axis.plan.titled(content['text']))
 
 
 def run(plan: RunPlan, requests: StopRequests) -> RunWatch:
