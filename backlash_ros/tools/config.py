@@ -148,14 +148,15 @@ def _no_such_axis(axis: str, axes: Sequence[str]) -> str:
 
 def _merged(path: Path, sections: Sequence[Section]) -> dict[str, Value]:
     """The values of sections, of each name those of the most specific; raises InputError."""
-    merged: dict[str, Value] = {}
-    ranks: dict[str, tuple[bool, bool]] = {}
-    ranked = [((s.node != ANY, s.axis not in (ANY, '')), s.values) for s in sections]
-    for rank, values in sorted(ranked, key=lambda each: each[0], reverse=True):
-        for name, value in values.items():
-            if ranks.setdefault(name, rank) == rank and merged.setdefault(name, value) != value:
-                raise InputError(f'{path}: {name} has two values, {merged[name]!r} and {value!r}')
-    return merged
+    merged: dict[str, tuple[tuple[bool, bool], Value]] = {}
+    for rank, section in sorted((((s.node != ANY, s.axis not in (ANY, '')), s) for s in sections),
+                                key=lambda each: each[0]):
+        for name, value in section.values.items():
+            known, other = merged.get(name, (rank, value))
+            if known == rank and other != value:
+                raise InputError(f'{path}: {name} has two values, {other!r} and {value!r}')
+            merged[name] = rank, value
+    return {name: value for name, (_, value) in merged.items()}
 
 
 class _StrictLoader(yaml.SafeLoader):
@@ -173,13 +174,9 @@ class _StrictLoader(yaml.SafeLoader):
 def _read_sections(path: Path) -> list[Section]:
     try:
         document = yaml.load(path.read_text(encoding='utf-8'), Loader=_StrictLoader)
-    except OSError as error:
-        raise InputError(f'{path}: cannot be read: {error.strerror}') from None
-    except yaml.MarkedYAMLError as error:
-        line = f' line {error.problem_mark.line + 1}:' if error.problem_mark else ''
-        raise InputError(f'{path}:{line} {error.problem}') from None
-    except (UnicodeDecodeError, yaml.YAMLError):
-        raise InputError(f'{path}: is not a text file in UTF-8') from None
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        reason = error.strerror if isinstance(error, OSError) else ' '.join(str(error).split())
+        raise InputError(f'{path}: cannot be read: {reason}') from None
     try:
         if not isinstance(document, dict) or not document:
             raise InputError('must hold "/**: {ros__parameters: {...}}"')
@@ -214,11 +211,10 @@ def _checked(name: str, values: Mapping[str, object], joints: Sequence[str]) -> 
         axis = ANY
     elif '/' in axis or not (node in NODES or (node == ANY and axis not in ('', ANY))):
         known = [f'/{ANY}', *(f'/{each}' for each in NODES)]
-        similar = [f'/{axis}/{each}' for each in (*NODES, ANY)] if axis else known
+        similar = [*known, *(f'/{axis}/{each}' for each in (*NODES, ANY))]
         near = difflib.get_close_matches(name, similar, n=1)
-        cure = f': did you mean {near[0]}?' if near else \
-            f', /AXIS/{ANY}, /AXIS/{CONTROLLER} ...' if axis else ''
-        raise InputError(f'section {name!r} is none of {", ".join(known)}{cure}')
+        raise InputError(f'section {name!r} is none of {", ".join(known)}, /AXIS/{ANY}, '
+                         f'/AXIS/{CONTROLLER} ...' + ''.join(f': did you mean {n}?' for n in near))
     Parameters({'joints': joints, **values})  # checks all names and values
     checked = {}
     for key, value in values.items():

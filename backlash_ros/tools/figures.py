@@ -257,8 +257,8 @@ def draw_error_curves(loops: Sequence[ErrorCurves], window_s: float) -> Figure:
     figure, grid = draw_panels(4.2 * len(rows), rows)
     for axes, lines in zip(grid[:, 0], rows.values(), strict=True):
         known = [size[np.isfinite(size) & (size > 0.0)] for _, size, *_ in lines]
-        axes.set_yscale('log')
         if highest := [float(size.max()) for size in known if size.size]:
+            axes.set_yscale('log')
             # An error begins at zero; a law that diverges leaves the axes.
             low, high = np.percentile(np.concatenate(known), 2), 1e3 * np.median(highest)
             axes.set_ylim(0.6 * float(low), 1.7 * min(max(highest), float(high)))

@@ -100,10 +100,10 @@ def test_written_configuration_is_read_back_unchanged(config: Path) -> None:
     ('/plant: {ros__parameters: {seed: 1}}\nplant: {ros__parameters: {seed: 2}}',
      'seed has two values, 1 and 2'),
     ('/controller: {ros__parameters: {seed: 1}}', 'is not a parameter of controller'),
-    ('/**: {ros__parameters: {seed: 1, seed: 2}}', "line 1: 'seed' is given twice"),
+    ('/**: {ros__parameters: {seed: 1, seed: 2}}', "'seed' is given twice"),
     ('/**: {seed: 1}', 'must hold ros__parameters'),
     ('/**: {ros__parameters: }', 'must hold "name: value" lines'),
-    ('/**: {ros__parameters: {seed: [}}', 'line 1:'),
+    ('/**: {ros__parameters: {seed: [}}', 'line 1'),
     ('seed', 'must hold'),
     ('', 'must hold'),
     ('/**: {ros__parameters: {5: 1}}', '5 is not a parameter'),
@@ -128,7 +128,7 @@ def test_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
         read_configuration(tmp_path / 'nothing.yaml').given()
     binary = tmp_path / 'binary.yaml'
     binary.write_bytes(b'\xff\xfe\x00')
-    with pytest.raises(InputError, match='not a text file'):
+    with pytest.raises(InputError, match='utf-8'):
         read_configuration(binary).given()
 
 
