@@ -36,15 +36,13 @@ class Result(NamedTuple):
     """What became of a loop, as the table has it. note: why the run broke off."""
 
     name: str
-    merits: tuple[float | None, ...] = ()
+    merits: tuple[float | None, ...] = (None,) * (len(COMPARISON_HEADER) - 1)
     curves: ErrorCurves | None = None
     note: str = ''
 
     @property
     def row(self) -> tuple[str, ...]:
-        cells = ['broke off', *[cli.NOTHING] * (len(COMPARISON_HEADER) - 2)] if self.note else \
-            [cli.number(merit, 3) for merit in self.merits]
-        return (self.name, *cells)
+        return (self.name, *(cli.number(merit, 3) for merit in self.merits))
 
 
 def contenders(scenario: Parameters) -> dict[str, dict[str, object]]:
@@ -74,7 +72,6 @@ def _fixed(m: float, c_r: float, c_l: float) -> dict[str, object]:
 
 
 def compare(scenario: Parameters, samples: int) -> list[Result]:
-    """Run every loop and return its figures of merit."""
     bar = tqdm(contenders(scenario).items(), desc='compare', unit='loop', disable=None)
     return [_measure(name, scenario, changes, samples) for name, changes in bar]
 
@@ -126,7 +123,8 @@ def _compare(args: Sequence[str] | None) -> None:
     results = compare(scenario, cli.number_of_samples(scenario, options.duration))
     # Drawing libraries take a second to load, which bad input should not cost.
     from backlash_ros.tools.figures import draw_error_curves, png
-    print(cli.format_table(COMPARISON_HEADER, [result.row for result in results]))
+    rows = [result.row for result in results]
+    print(cli.format_table(COMPARISON_HEADER, rows))
     out = result_directory(options.out)
     figure, document = 'images/comparison.png', out / 'comparison.md'
     (out / figure).parent.mkdir(parents=True, exist_ok=True)
@@ -139,9 +137,8 @@ def _compare(args: Sequence[str] | None) -> None:
         {name: f'{value:g}' for name, value in numbers.items() if isinstance(value, float)},
         figure=figure, waveform=scenario.waveform, header=' | '.join(COMPARISON_HEADER),
         rule='|---' * len(COMPARISON_HEADER),
-        rows='\n'.join(f'| {" | ".join(result.row)} |' for result in results),
-        notes=''.join(f'- {result.name}: {result.note}.\n' for result in results if result.note),
-    ))
+        rows='\n'.join(f'| {" | ".join(row)} |' for row in rows),
+        notes=''.join(f'- {result.name}: {result.note}.\n' for result in results if result.note)))
     print(f'document: {document}')
 
 

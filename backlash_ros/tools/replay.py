@@ -4,6 +4,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 from functools import partial
+from itertools import product
 from math import isnan, nan
 from pathlib import Path
 from typing import NamedTuple
@@ -55,19 +56,16 @@ def _replay(args: Sequence[str] | None) -> None:
         _one(sources[0], options.out)
         return
     rows: list[tuple[str | float, ...]] = []
-    for source in sources:
-        for change in changes:
-            words = ' '.join(f'{name}={as_yaml(value)}' for name, value in change.items())
-            run = _replayed(source._replace(parameters=source.parameters.replaced(change)))
-            tracking = run.column('t')[run.column('status') == Status.TRACKING]
-            innovation = run.column('innovation')[run.samples // 2:]
-            known = innovation[np.isfinite(innovation)]
-            rows.append((
-                str(source.path), words,
-                *(float(run.column(std + name)[-1]) for std in ('', 'std_') for name in BACKLASH),
-                float(tracking[0]) if len(tracking) else nan,
-                float(np.sqrt(np.mean(known**2))) if len(known) else nan,
-            ))
+    for source, change in product(sources, changes):
+        words = ' '.join(f'{name}={as_yaml(value)}' for name, value in change.items())
+        run = _replayed(source._replace(parameters=source.parameters.replaced(change)))
+        tracking = run.column('t')[run.column('status') == Status.TRACKING].tolist()
+        innovation = run.column('innovation')[run.samples // 2:]
+        known = innovation[np.isfinite(innovation)]
+        rows.append((
+            str(source.path), words,
+            *(float(run.column(std + name)[-1]) for std in ('', 'std_') for name in BACKLASH),
+            next(iter(tracking), nan), float(np.sqrt(np.mean(known**2))) if len(known) else nan))
     header = ('run', 'changed', *BACKLASH, *(f'std_{name}' for name in BACKLASH),
               'tracking from [s]', 'innovation RMS')
     path = result_directory(options.out) / 'replays.csv'
@@ -82,9 +80,8 @@ def _opened(path: Path, options: argparse.Namespace, span: cli.Span) -> Source:
     for text in run.notes:
         print(f'replay: {"warning: " if applied is None else ""}{text}', file=sys.stderr)
     if run.parameters is None:
-        raise cli.InputError(f'{path}: ' + (
-            'no parameters.yaml stands beside it: give --config' if applied is None else
-            'is a log: give --config, like identified.yaml of `identify`'))
+        raise cli.InputError(f'{path}: no parameters.yaml stands beside it: give --config, like '
+                             'identified.yaml of `identify`')
     settings = list(map(parse_setting, options.settings))
     if any(setting.axis for setting in settings):
         raise cli.InputError('--set: leave out the axis: there is one run')
@@ -95,7 +92,7 @@ def _opened(path: Path, options: argparse.Namespace, span: cli.Span) -> Source:
         return Source(path, run.record, parameters, applied)
     use, bag = report_use(parameters), find_bag(path)
     reports = read_reports(bag, run.record.column('y'), options.axis) \
-        if use != 'false' and bag is not None else []
+        if use != 'false' and bag else []
     if use == 'true' and not reports:
         print(f'replay: warning: {path}: holds no applied_control: v is that of control',
               file=sys.stderr)
@@ -118,8 +115,8 @@ def _one(source: Source, out: Path | None) -> None:
     replayed = _replayed(source)
     directory = result_directory(out)
     summary = write_report(Run(replayed, source.parameters), directory)
-    figure = figures.draw_estimates(replayed, recorded)
-    write_atomically(directory / 'replay.png', figures.png(figure))
+    write_atomically(directory / 'replay.png',
+                     figures.png(figures.draw_estimates(replayed, recorded)))
     print(cli.format_table(('', 'run', 'replay', '±'), [
         (name, cli.number(recorded.column(name)[-1], 6), cli.number(summary['final'][name], 6),
          cli.number(summary['final_std'][name], 2)) for name in BACKLASH
@@ -129,7 +126,7 @@ def _one(source: Source, out: Path | None) -> None:
         begins = np.append(0, np.flatnonzero(np.diff(status)) + 1)
         states = [f'{Status(int(status[k])).word} from {replayed.column("t")[k]:.3g} s'
                   for k in begins[:8]]
-        print(f'states: {", ".join(states)}', *[f'… ({len(begins)} in all)'] * (len(begins) > 8))
+        print(f'{len(begins)} states: {", ".join(states)}')
     elif parted is None:
         print('the estimates are those of the run, to the last bit')
     else:

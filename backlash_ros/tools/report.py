@@ -34,10 +34,8 @@ def write_report(run: files.Run, out: Path) -> dict[str, Any]:
     notes, lost = list(run.notes), summary['lost_samples']
     if lost > 0.01 * (total := lost + summary['samples']) \
             and not (run.parameters and run.parameters.output_loss):
-        notes.append(
-            f'{lost} of {total} samples were lost: what the figures show at these times is not the '
-            'doing of the law; is the machine too busy for this sample period?'
-        )
+        notes.append(f'{lost} of {total} samples were lost: is the machine too busy for this '
+                     'sample period?')
     # Of a log, which has no estimates, it is what was made of its rows.
     of_log = np.isnan(run.record.column('m')[-1])
     for note in notes:
@@ -113,8 +111,7 @@ def headline(summary: Mapping[str, Any]) -> str:
         return 'A log of v and y, which no controller has estimated anything from: ' \
                '<code>identify</code> tells its backlash, <code>replay</code> what a controller ' \
                'would have learned.'
-    law, times = summary['estimator'], summary['settling_time_s']
-    who = f'The law <b>{escape(law)}</b>' if law else 'The controller'
+    times, who = summary['settling_time_s'], f'The law <b>{summary["estimator"] or "–"}</b>'
     if summary['truth']['m'] is None:
         return f'{who} estimated the backlash; no truth was recorded to compare with.'
     if late := [HTML_SYMBOLS[name] for name, time in times.items() if time is None]:
@@ -126,12 +123,10 @@ def headline(summary: Mapping[str, Any]) -> str:
 def _tables(summary: Mapping[str, Any]) -> str:
     rows = [
         (symbol, *told.estimate_cells(summary, name), 'of u/v' if name == 'm' else 'of v')
-        for name, symbol in HTML_SYMBOLS.items()
-    ]
+        for name, symbol in HTML_SYMBOLS.items()]
     rows.append(('f', number(summary['final']['f'], 6), *[NOTHING] * 4, 'of u/v'))
     latency = summary['loop_latency_ms'] or {'p50': None, 'p99': None}
     duration = (summary['samples'] + summary['lost_samples']) * summary['sample_period']
-    unexplained = summary['unexplained']
     first = summary['began_with']
     began = ', '.join(f'{name} {number(first[name], 6)}' for name in BACKLASH)
     return table(('', *told.ESTIMATE_HEADER, 'unit'), rows) + facts([
@@ -148,8 +143,8 @@ def _tables(summary: Mapping[str, Any]) -> str:
         ('latency y → v, 99th percentile', number(latency['p99'], 3, 'ms')),
         ('state at the end', escape(summary['final_status'] or NOTHING)),
         ('noise on y, learned / nominal', number(summary['noise_ratio'], 3)),
-        ('unexplained motion of u', NOTHING if unexplained == np.inf else
-         number(unexplained, 3, '% of m times the gap', 100.0)),
+        ('unexplained motion of u',
+         number(summary['unexplained'], 3, '% of m times the gap', 100.0)),
         ('samples in state tracking',
          number((summary['status_share'] or {}).get('tracking'), 3, '%', 100.0)),
     ])

@@ -7,9 +7,7 @@ from functools import partial
 from math import inf
 
 from backlash_ros.core.estimate import Status
-from backlash_ros.core.loop.diagnosis import Learning, LoopFigures, Neighbours, state_beside
-from backlash_ros.core.loop.sample_counter import Timing
-from backlash_ros.core.parameters import Parameters, as_yaml
+from backlash_ros.core.parameters import Parameters, Value, as_yaml
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.options import OptionParser
 from backlash_ros.tools import batch, cli
@@ -55,13 +53,9 @@ def _once(parameters: Parameters, options: argparse.Namespace) -> None:
     run = run_loop(loop, samples)
     directory = result_directory(options.out)
     print(estimate_table(write_report(Run(run, parameters), directory)))
-    law = loop.controller.estimator
-    if law.estimate.status != Status.TRACKING:
-        state = state_beside(set(), LoopFigures(
-            timing=Timing(parameters.sample_period), around=Neighbours(),
-            learning=Learning(law.estimate.status, law.report),
-        ))
-        print(f'at the end: {state.text}')
+    status = loop.controller.estimator.estimate.status
+    if status != Status.TRACKING:
+        print(f'at the end: {status.word}')
     print(f'report: {directory / REPORT_PAGE}')
 
 
@@ -81,8 +75,7 @@ def _many(parameters: Parameters, options: argparse.Namespace) -> None:
     write_table(csv, (*swept, 'seed', *batch.OUTCOME_COLUMNS), [
         [*(list(value) if isinstance(value := job.values[name], tuple) else value
            for name in (*swept, 'seed')), *outcome.values()]
-        for job, outcome in zip(jobs, outcomes, strict=True)
-    ])
+        for job, outcome in zip(jobs, outcomes, strict=True)])
     size = len(outcomes) // len(changes)  # the jobs of one change stand together
     rows = []
     for i, change in enumerate(changes):
@@ -97,16 +90,14 @@ def _many(parameters: Parameters, options: argparse.Namespace) -> None:
         ] for name, s in batch.statistics(group).items()]
     print(cli.format_table([*swept, '', 'bias', 'RMSE', 'settled, median', 'settled, last',
                             'within 1 %'], rows))
-    named: dict[str, list[str]] = {}
+    named: dict[str, list[Value]] = {}
     for job, outcome in zip(jobs, outcomes, strict=True):
-        what = f'broke off ({outcome["problem"]})' if outcome['problem'] else \
-            'not within 1 % at the end'
         if outcome['problem'] or None in [outcome[f'settling_{name}'] for name in BACKLASH]:
-            named.setdefault(what, []).append(str(job.values['seed']))
+            what = f'broke off ({outcome["problem"]})' if outcome['problem'] else \
+                'not within 1 % at the end'
+            named.setdefault(what, []).append(job.values['seed'])
     for what, of in named.items():
-        shown = list(dict.fromkeys(of))
-        print(f'{what}: {len(of)} run{"s" if len(of) > 1 else ""}, seed {", ".join(shown[:10])}'
-              f'{", ..." if len(shown) > 10 else ""}')
+        print(f'{what}: {len(of)} runs, seed {", ".join(map(str, dict.fromkeys(of)))}')
     print(f'runs: {csv}')
 
 

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
-from typing import Any
 
 from backlash_ros.core.assembly import build_controller, build_plant, build_reference
 from backlash_ros.core.parameters import ParameterError, Parameters
@@ -24,8 +23,7 @@ ELSEWHERE = 'none'  # the parameter driver where somebody else starts it
 class AxisPlan:
     """One controller of a run, its parameters complete and checked; name: also its namespace.
 
-    Of the parameters, samples is the length of the whole run, 0 without end, and driver a command,
-    empty for the simulated plant.
+    Of the parameters, samples is 0 without end, and driver empty for the simulated plant.
     """
 
     name: str
@@ -47,7 +45,6 @@ class AxisPlan:
         return f'{self.name}: {text}' if self.name else text
 
     def process_name(self, node: str) -> str:
-        """Name of one of its processes in messages."""
         return f'{self.name}/{node}' if self.name else node
 
 
@@ -81,8 +78,7 @@ def prepare(options: argparse.Namespace) -> RunPlan:
         if file and users.setdefault(file, name) != name:
             raise ParameterError(
                 'estimates.file', file, f'is the file of {users[file]} and of {name}',
-                f'give each axis one of its own, like --set {name}/estimates.file=...',
-            )
+                f'give each axis one of its own, like --set {name}/estimates.file=...')
         if options.out is not None and (options.out / name / BAG).exists():
             raise InputError(f'--out={options.out}: holds a bag already, choose another folder')
     if options.unlimited and not any(p.driver for p in parameters.values()):
@@ -93,12 +89,9 @@ def prepare(options: argparse.Namespace) -> RunPlan:
     # The nodes need a path that holds wherever it is read.
     out = result_directory(options.out).resolve()
     axes = tuple(AxisPlan(name, p, out / name, options.record) for name, p in parameters.items())
-    try:
-        for axis in axes:
-            axis.logs.mkdir(parents=True, exist_ok=True)
-            write_config(axis.parameters, axis.out / CONFIG_FILE)
-    except OSError as error:
-        raise InputError(f'{out}: cannot be written: {error.strerror}') from None
+    for axis in axes:
+        axis.logs.mkdir(parents=True, exist_ok=True)
+        write_config(axis.parameters, axis.out / CONFIG_FILE)
     return RunPlan(axes, out, 0 if options.live and not options.live_port else options.live_port)
 
 
@@ -155,10 +148,8 @@ def plan_processes(plan: RunPlan, domain: int | None) -> list[list[Child]]:
             order = ('controller', '', '' if p.joints else 'reference', 'recorder')
         for stage, node in zip(stages, order, strict=True):
             if node:
-                stage.append(_child(
-                    axis, node, _arguments(axis, node), domain, axis.process_name(node),
-                    # The controller may end with a ramp, and then saves what it has learned.
-                    grace_s=p.timeout.ramp if node == 'controller' else 0.0))
+                stage.append(_child(axis, node, _arguments(axis, node), domain,
+                                    p.timeout.ramp if node == 'controller' else 0.0))
         if p.driver and p.driver != ELSEWHERE:
             served.setdefault(p.driver, []).append(axis)
     for command, axes in served.items():
@@ -171,22 +162,23 @@ def plan_processes(plan: RunPlan, domain: int | None) -> list[list[Child]]:
             name, tuple(shlex.split(command)), log,
             foreign_environment(child_environment(log.parent, domain)), foreign=True,
             # The last command of the controller acts from the next sample of the driver on.
-            settle_s=min(2.0 * max(axis.parameters.sample_period for axis in axes), 1.0),
-        ))
+            settle_s=min(2.0 * max(axis.parameters.sample_period for axis in axes), 1.0)))
     if plan.live_port is not None:
         shown = [f'/{axis.name}' if axis.name else '/controller' for axis in plan.axes]
         stages[-1].append(_child(plan.axes[0], 'live', ['--port', str(plan.live_port), *shown],
-                                 domain, 'live', spectator=True))
+                                 domain))
     return stages
 
 
 def _child(
-    axis: AxisPlan, node: str, arguments: Sequence[str], domain: int | None, name: str,
-    **others: Any,
+    axis: AxisPlan, node: str, arguments: Sequence[str], domain: int | None, grace_s: float = 0.0,
 ) -> Child:
+    live = node == 'live'  # one for all axes
     return Child(
-        name, (sys.executable, '-m', f'backlash_ros.nodes.{node}', *arguments),
-        axis.logs / f'{node}.log', child_environment(axis.logs, domain), axis.name, **others)
+        node if live else axis.process_name(node),
+        (sys.executable, '-m', f'backlash_ros.nodes.{node}', *arguments),
+        axis.logs / f'{node}.log', child_environment(axis.logs, domain), axis.name,
+        spectator=live, grace_s=grace_s)
 
 
 def _arguments(axis: AxisPlan, node: str) -> list[str]:
@@ -199,8 +191,6 @@ def _arguments(axis: AxisPlan, node: str) -> list[str]:
         # The loop and the recorder; in real time the reference follows plant_output as well, in
         # lockstep it follows /clock.
         settings = ['-p', f'wait_for_subscribers:={3 if node == "plant" and not lockstep else 2}']
-    if axis.name:
-        settings += ['-r', f'__ns:=/{axis.name}']
-        if lockstep:
-            settings += ['-r', '/clock:=clock']  # each axis has a time of its own
+    if axis.name:  # each axis has a time of its own
+        settings += ['-r', f'__ns:=/{axis.name}', *['-r', '/clock:=clock'] * lockstep]
     return ['--ros-args', '--params-file', str(axis.out / CONFIG_FILE), *settings]

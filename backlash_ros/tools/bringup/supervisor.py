@@ -50,12 +50,11 @@ def with_source(environment: Mapping[str, str]) -> dict[str, str]:
 
 def foreign_environment(environment: Mapping[str, str]) -> dict[str, str]:
     """The same for another program: what ROS 2 wheels have set is for this Python alone."""
-    foreign = dict(environment)
-    foreign.pop('BACKLASH_ROS_EVENTS', None)
+    foreign = {name: value for name, value in environment.items() if name != 'BACKLASH_ROS_EVENTS'}
     if foreign.pop('_ROS_WHEELS_BOOTSTRAP_COMPLETE', None):
-        folders = foreign.pop('LD_LIBRARY_PATH', '').split(os.pathsep)
-        kept = [folder for folder in folders if not Path(folder).is_relative_to(sys.prefix)]
-        foreign['LD_LIBRARY_PATH'] = os.pathsep.join(filter(None, kept))
+        foreign['LD_LIBRARY_PATH'] = os.pathsep.join(
+            folder for folder in foreign.get('LD_LIBRARY_PATH', '').split(os.pathsep)
+            if folder and not Path(folder).is_relative_to(sys.prefix))
     return foreign
 
 
@@ -89,9 +88,8 @@ def free_domain() -> Iterator[int]:
 class Child:
     """A process, from plan to end. axis: that its events are about.
 
-    foreign: no node of this package: all that it prints goes to its log, and signals reach it from
-    the very start. spectator: the run goes on without it. settle_s: passes before it is stopped, as
-    what was stopped before still has an effect on it. grace_s: for its end, beyond the usual time.
+    foreign: no node of this package, which tells nothing but by its log. spectator: the run goes on
+    without it. settle_s: passes before it is stopped. grace_s: beyond the usual time for its end.
     """
 
     name: str
@@ -113,29 +111,26 @@ class Child:
         try:
             with self.log.open('ab') as log:
                 self.process = subprocess.Popen(
-                    self.command, stdin=subprocess.DEVNULL,
-                    stdout=log if self.foreign else subprocess.PIPE, stderr=log,
-                    env=self.environment, start_new_session=True,
-                )
+                    self.command, stdin=subprocess.DEVNULL, stderr=log, env=self.environment,
+                    stdout=log if self.foreign else subprocess.PIPE, start_new_session=True)
         except OSError as error:
-            raise BrokenOffError(
-                f'{self.name} does not start: {self.command[0]}: {error.strerror}'
-            ) from error
+            raise BrokenOffError(f'{self.name} does not start: {self.command[0]}: '
+                                 f'{error.strerror}') from error
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def pass_on(self, events: 'SimpleQueue[tuple[Child, dict[str, Any]]]') -> None:
-        """Read its output to the end; JSON objects with `event` are passed on, all else is logged.
-        """
+        """Read its output: JSON objects with `event` are passed on, all else is logged."""
         assert self.process.stdout is not None
         with self.process.stdout as lines, self.log.open('ab', 0) as log:
             for line in lines:
+                content = None
                 with suppress(ValueError):
                     content = json.loads(line)
-                    if isinstance(content, dict) and 'event' in content:
-                        events.put((self, content))
-                        continue
-                log.write(line)
+                if isinstance(content, dict) and 'event' in content:
+                    events.put((self, content))
+                else:
+                    log.write(line)
 
     def describe_end(self, what: str, further: str = '') -> str:
         """What became of it, how it exited, and the end of its log."""
@@ -144,7 +139,6 @@ class Child:
         return f'{self.name} {what} ({end}){further}, the end of {self.end_of_log()}'
 
     def end_of_log(self) -> str:
-        """The last ten lines of the log, indented."""
         lines = self.log.read_text(encoding='utf-8', errors='replace').splitlines()
         quoted = ''.join(f'\n    {line}' for line in lines[-10:])
         return f'{self.log}:{quoted}' if quoted else f'{self.log} is empty'
@@ -166,8 +160,7 @@ class ProcessSupervisor:
         self._guardian = subprocess.Popen(
             (sys.executable, '-m', 'backlash_ros.tools.bringup.supervisor'), bufsize=0,
             stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, env=with_source(os.environ),
-            start_new_session=True,
-        )
+            start_new_session=True)
         assert self._guardian.stdin is not None
         try:
             for child in chain(*self._stages):
@@ -176,9 +169,9 @@ class ProcessSupervisor:
                 with suppress(BrokenPipeError):
                     self._guardian.stdin.write(f'{json.dumps(self._to_stop())}\n'.encode())
                 if not child.foreign:
-                    self._readers.append(Thread(
-                        target=child.pass_on, args=(self._events,), daemon=True))
-                    self._readers[-1].start()
+                    reader = Thread(target=child.pass_on, args=(self._events,), daemon=True)
+                    self._readers.append(reader)
+                    reader.start()
         except BaseException:
             self.__exit__()
             raise
@@ -209,20 +202,15 @@ class ProcessSupervisor:
 
     def _to_stop(self) -> list[tuple[list[int], float, float]]:
         """Of each stage its process groups, and the longest settle_s and grace_s."""
-        return [(
-            [child.process.pid for child in stage if child in self.children],
-            max((child.settle_s for child in stage), default=0.0),
-            max((child.grace_s for child in stage), default=0.0),
-        ) for stage in self._stages]
+        return [([child.process.pid for child in stage if child in self.children],
+                 max((child.settle_s for child in stage), default=0.0),
+                 max((child.grace_s for child in stage), default=0.0)) for stage in self._stages]
 
 
 def stop_groups(
     groups: Sequence[int], settle_s: float, grace_s: float, hurry: Callable[[], bool],
 ) -> None:
-    """Signal process groups, ever more firmly, until none is alive or all means are used up.
-
-    settle_s: before the first signal. grace_s: beyond the usual time. hurry: skips to SIGKILL.
-    """
+    """Signal process groups, ever more firmly, until none is alive; hurry: skip to SIGKILL."""
     (first, usual_s), *others = ESCALATION
     # The signal 0 is none.
     for number, patience_s in ((0, settle_s), (first, usual_s + grace_s), *others):

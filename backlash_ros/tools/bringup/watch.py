@@ -29,7 +29,7 @@ class AxisProgress:
     """How far an axis has come. first: number of the sample that counts as the first.
 
     began, moved, next_line: on the monotonic clock [s]. published: samples and messages by topic of
-    a simulated plant that is done; heard: those of them that were. silent: whether that was said.
+    a simulated plant that is done; heard: those of them that the recorder has.
     """
 
     plan: AxisPlan

@@ -30,7 +30,7 @@ class Run:
     """A run that was simulated or recorded; parameters are None where they are unknown.
 
     latency_s: from the departure of y(k) at the driver to that of v(k) at the controller, shape
-    (N,), nan where unknown; None for a simulation. notes: on the source, a sentence each.
+    (N,); None for a simulation. notes: on the source, a sentence each.
     """
 
     record: RunRecord
@@ -82,8 +82,7 @@ def write_run(run: RunRecord, directory: Path) -> None:
     buffer = io.BytesIO()
     np.savez_compressed(
         buffer, columns=np.array(COLUMNS), rows=run.rows, sample_period=run.sample_period,
-        lost_samples=run.lost_samples, **arrays,
-    )
+        lost_samples=run.lost_samples, **arrays)
     write_atomically(directory / RECORD_FILE, buffer.getvalue())
 
 
@@ -105,8 +104,7 @@ def read_record(path: Path) -> RunRecord:
             return RunRecord(
                 _rows_of(stored['columns'].tolist(), stored['rows']),
                 float(stored['sample_period']), int(stored['lost_samples']),
-                from_fields(fields) if fields else None,
-            )
+                from_fields(fields) if fields else None)
     except (OSError, KeyError, ValueError, IndexError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f'{path}: is not a record of a run: {error}') from None
 

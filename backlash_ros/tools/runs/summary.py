@@ -68,13 +68,11 @@ def summarise(
         'truth': {name: newest[f'true_{name}'] if run.has_truth else None for name in BACKLASH},
         'settling_time_s': {
             name: run_record.settling_time(t, run.column(name), run.column(f'true_{name}'))
-            if run.has_truth else None for name in BACKLASH
-        },
+            if run.has_truth else None for name in BACKLASH},
         'control_error_rms': run_record.control_error_rms(run),
         'tracking_error_rms': _following(run, parameters)[1],
-        'loop_latency_ms': {
-            f'p{q}': 1e3 * float(np.percentile(latency, q)) for q in (50, 99)
-        } if latency.size else None,
+        'loop_latency_ms': {f'p{q}': 1e3 * float(np.percentile(latency, q)) for q in (50, 99)}
+        if latency.size else None,
         'final_status': words.get(newest['status']),
         'status_share': {word: float(np.mean(status == state)) for state, word in words.items()}
         if status.size else None,
@@ -107,8 +105,8 @@ def estimate_cells(summary: Mapping[str, Any], name: str) -> tuple[str, ...]:
 
 def estimate_table(summary: Mapping[str, Any], title: str = '') -> str:
     """The estimates of a run as text; title: of the first column."""
-    rows = [(name, *estimate_cells(summary, name)) for name in BACKLASH]
-    return format_table((title, *ESTIMATE_HEADER), rows)
+    return format_table((title, *ESTIMATE_HEADER),
+                        [(name, *estimate_cells(summary, name)) for name in BACKLASH])
 
 
 def control_error(run: RunRecord) -> Array:
@@ -154,18 +152,14 @@ def compare_laws(
     compared = t < (samples - 0.5) * run.sample_period
     curves = [ErrorCurves(f'{own} (this run)', t[compared],
                           moving_rms(control_error(run)[compared], window))]
-    for law in LAWS:
-        if law == own or not law_fits(law, parameters.structure):
-            continue
+    for law in (law for law in LAWS if law != own and law_fits(law, parameters.structure)):
         try:
             other = run_loop(build_closed_loop(parameters.replaced({
-                'estimator.law': law, 'estimates.load': False,
-            })), samples)
+                'estimator.law': law, 'estimates.load': False})), samples)
         except (ParameterError, InputError, BrokenOffError) as error:
             notes.append(f'{law}: {error}')
-        else:
-            curves.append(ErrorCurves(
-                law, other.column('t'), moving_rms(control_error(other), window)))
+            continue
+        curves.append(ErrorCurves(law, other.column('t'), moving_rms(control_error(other), window)))
     return curves, window_s, notes
 
 
