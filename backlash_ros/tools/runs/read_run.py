@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from itertools import chain, pairwise
+from itertools import chain
 from math import isnan
 from pathlib import Path
 from typing import Any
@@ -102,16 +102,12 @@ def read_topics(
             damage = 'is damaged'
     for messages in found.values():
         messages.sort(key=lambda each: each[0])
-    damage = reader.damage or damage
-    if damage and not reader.topics:
-        raise InputError(f'{path}: {damage}, and nothing of it can be read')
-    if damage:
-        stamps = [stamp for messages in found.values() for stamp, _ in messages] or [0]
-        damage = (
-            f'{path} {damage}: this is what is left, {sum(map(len, found.values()))} messages of '
-            f'{1e-9 * (max(stamps) - min(stamps)):.1f} s; once it is not being recorded any more, '
-            f'`{REPAIR_COMMAND} {path}` completes it'
-        )
+    if damage := reader.damage or damage:
+        if not reader.topics:
+            raise InputError(f'{path}: {damage}, and nothing of it can be read')
+        damage = (f'{path} {damage}: this is what is left, {sum(map(len, found.values()))} '
+                  'messages; once it is not being recorded any more, '
+                  f'`{REPAIR_COMMAND} {path}` completes it')
     return found, sorted(topic.name for topic in reader.topics), damage
 
 
@@ -138,25 +134,22 @@ def read_reports(path: Path, y: Array, axis: str = '') -> list[list[float]]:
     outputs, reports = (heard.get(choose_namespace(
         sorted(name for name in heard if topic_ends_like(name, topic)), axis,
     )[0], []) for topic in (topics.PLANT_OUTPUT, topics.APPLIED_CONTROL))
-    stamps: list[int] = []
     remaining = iter(outputs)
-    for value in y.tolist():
-        found = next((stamp for stamp, message in remaining if message.data == value), None)
-        if found is None:
-            return []
-        stamps.append(found)
-    until = np.searchsorted([stamp for stamp, _ in reports], stamps, side='right').tolist()
-    values = [float(message.data) for _, message in reports]
-    return [[], *(values[a:b] for a, b in pairwise(until))] if values else []
+    stamps = [next((stamp for stamp, message in remaining if message.data == value), -1)
+              for value in y.tolist()]
+    if -1 in stamps or not reports:
+        return []
+    ends = np.searchsorted([stamp for stamp, _ in reports], stamps, side='right')
+    values = np.array([message.data for _, message in reports])
+    return [[], *(part.tolist() for part in np.split(values, ends)[1:-1])]
 
 
 def read_bag(
     path: Path, sample_period: float | None = None, span: Span = WHOLE_SPAN, axis: str = '',
 ) -> Run:
-    """Read the run that a bag holds, of a damaged one what is left; its parameters are unknown.
+    """What the last controller did within the span, of a damaged bag what is left of it.
 
-    sample_period: None takes the median distance of the stamps. A gap in the count is a lost
-    sample. It is what the last controller did within the span. Raises InputError.
+    sample_period: None takes the median distance of the stamps. Raises InputError.
     """
     last_parts = {topic.rpartition('/')[2] for topic in topics.LABELS_OF}
     recorded, names, damage = read_topics(
@@ -178,8 +171,7 @@ def read_bag(
         if not signals['stamp'].size:
             raise InputError('holds no sample between --from and --to')
         count, of_signals, of_estimates = np.intersect1d(
-            signals['sample'], estimates['sample'], assume_unique=True, return_indices=True
-        )
+            signals['sample'], estimates['sample'], assume_unique=True, return_indices=True)
         if count.size == 0:
             raise InputError(f'no sample has both {topics.SIGNALS} and {topics.ESTIMATES}')
         if sample_period is None:
@@ -191,11 +183,9 @@ def read_bag(
                          'the bag, as no parameters were given')
     except InputError as error:
         raise InputError('; '.join(filter(None, (f'{path}: {error}', damage)))) from None
-    columns = {
-        **_rows(signals, of_signals), **_rows(estimates, of_estimates),
-        't': (count - count[0]) * sample_period,
-    }
+    columns = _rows(signals, of_signals) | _rows(estimates, of_estimates)
     columns |= _true_columns(columns['v'], count, truth)
+    columns['t'] = (count - count[0]) * sample_period
     heard = np.union1d(signals['sample'], estimates['sample'])
     if heard.size > count.size:
         notes.append(f'{heard.size - count.size} samples were left out: only one of signals and '
@@ -205,8 +195,7 @@ def read_bag(
         np.column_stack([columns.get(name, unknown) for name in COLUMNS]), sample_period,
         int(heard[-1] - heard[0]) + 1 - heard.size, _newest_model(
             [message for stamp, message in models if stamp >= signals['stamp'][0]], prefix))
-    notes = [damage, *notes, restarted]
-    return Run(record, None, columns['latency_s'], tuple(filter(None, notes)))
+    return Run(record, None, columns['latency_s'], tuple(filter(None, [damage, *notes, restarted])))
 
 
 def _of_axis(
@@ -232,9 +221,8 @@ def _of_axis(
                 prefix, axis = f'{axis or joints[0]}.', ''
         name, note = choose_namespace(names, axis)
         if not name and topic in (topics.SIGNALS, topics.ESTIMATES):
-            of_axis = f' of axis {axis}' if axis else ''
-            raise InputError(f'holds no message of {topic}{of_axis}; its topics are '
-                             f'{", ".join(all_names) or "none"}')
+            raise InputError(f'holds no message of {topic}{axis and " of axis "}{axis}; its topics '
+                             f'are {", ".join(all_names) or "none"}')
         if note:
             axis, notes = name.strip('/').split('/')[0], [*notes, note]
         found[topic] = recorded.get(name, [])
@@ -276,11 +264,8 @@ def _choose_section(tables: list[Table]) -> str:
         note = 'two controllers published at once: the first row of each sample is used'
     elif restarts.size:
         cut = signals['stamp'][restarts[-1]]
-        note = (
-            f'the controller restarted its count {restarts.size} time'
-            f'{"s" if restarts.size > 1 else ""}: this is what follows the last restart, '
-            f'{cut * 1e-9:.1f} s after the beginning; --from and --to choose another part'
-        )
+        note = ('the controller restarted its count: this is what follows the last restart, '
+                f'{cut * 1e-9:.1f} s after the beginning; --from and --to choose another part')
         # Signals by rows, as stamps of a simulated time may be equal.
         tables[:] = [_rows(signals, slice(restarts[-1], None)),
                      *(_rows(table, table['stamp'] >= cut) for table in tables[1:])]
@@ -298,7 +283,7 @@ def _true_columns(v: Array, count: Array, truth: Table) -> Table:
         sample_of = dict(zip(truth['v'].tolist(), sample.tolist(), strict=True))
         offsets = Counter(k - sample_of[value] for k, value in zip(count, v.tolist(), strict=True)
                           if value in sample_of)
-        sample = sample + max(offsets, key=offsets.__getitem__, default=0)
+        sample = sample + (offsets.most_common(1) or [(0, 0)])[0][0]
     _, here, there = np.intersect1d(count, sample, assume_unique=True, return_indices=True)
     u = np.full(count.size, np.nan)
     u[here] = truth['u'][there]
@@ -313,8 +298,7 @@ def _newest_model(messages: Sequence[Any], prefix: str) -> LearnedModel | None:
         parts = zip(_labels(message), np.split(message.data, ends), strict=False)
         fields = {label.removeprefix(prefix): values.tolist() for label, values in parts
                   if label.startswith(prefix)}
-        if not all(map(isnan, chain(*fields.values()))):
-            with suppress(KeyError, IndexError, ValueError):
+        with suppress(KeyError, IndexError, ValueError):
+            if not all(map(isnan, chain(*fields.values()))):
                 return from_fields(fields)
-            return None
     return None

@@ -107,7 +107,7 @@ def test_a_log_tells_what_the_controller_would_have_learned_from_it(tmp_path, ca
             run.column('t').tolist(), run.column('v').tolist(), y.tolist(), strict=True)))
     config.write_text('/**: {ros__parameters: {plant: {uncertainty: 0.0}}}')
     assert main([str(log), '--out', str(tmp_path / 'out')]) == 2
-    assert 'is a log: give --config' in capsys.readouterr().err
+    assert 'give --config' in capsys.readouterr().err
     assert main([str(log), '--config', str(config), '--out', str(tmp_path / 'out')]) == 0
     said = capsys.readouterr()
     assert 'states: acquiring from 0 s, tracking from' in said.out

@@ -286,7 +286,7 @@ def test_bag_of_a_restart_gives_a_report_of_what_came_last_and_says_so(
     assert same(read_bag(bag).record, second)
     assert report.main([str(bag), '--out', str(tmp_path / 'out')]) == 0
     line = capsys.readouterr().err.splitlines()[-1]
-    assert 'restarted its count 1 time: this is what follows the last restart, 1.5 s after' in line
+    assert 'restarted its count: this is what follows the last restart, 1.5 s after' in line
     assert '--from and --to' in line
     assert (tmp_path / 'out' / 'report.html').is_file()
 
