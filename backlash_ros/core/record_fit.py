@@ -8,6 +8,7 @@ import numpy as np
 
 from backlash_ros.core.estimate import Bounds
 from backlash_ros.core.estimation import explanations, settings
+from backlash_ros.core.estimation.fit import Window
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.posterior import WindowFit
 from backlash_ros.core.plant.transfer_function import Array, StateModel, TransferFunction
@@ -92,7 +93,7 @@ def fit_record(
 def _fitted(setup: explanations.Setup, v: Array, y: Array, bounds: Bounds | None) -> RecordFit:
     """Fit v (N,) and y (N,) after it, or -y where y moves against v."""
     family, swing = setup.family, float(np.ptp(v))
-    record = explanations.Window(0, v, y, np.full(len(v), nan))
+    record = Window(0, v, y, np.full(len(v), nan))
     fit, sign = explanations.afresh(setup, record), 1.0
     if fit is not None and fit.m < 0.0:
         record, sign = record._replace(y=-y), -1.0

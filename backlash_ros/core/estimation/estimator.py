@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from backlash_ros.core.estimate import Bounds, Estimate, Status
 from backlash_ros.core.estimation import settings
 from backlash_ros.core.estimation.belief import Belief, Kept, Known
-from backlash_ros.core.estimation.explanations import Setup, Window
+from backlash_ros.core.estimation.explanations import Setup
+from backlash_ros.core.estimation.fit import Window
 from backlash_ros.core.estimation.observer import Following, Place, state_after
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.state_machine import learn

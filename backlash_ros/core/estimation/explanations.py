@@ -6,19 +6,18 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import sqrt
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Bounds
 from backlash_ros.core.estimation import settings
-from backlash_ros.core.estimation.fit import FEW_STEPS, FIRST_STEPS, Problem
+from backlash_ros.core.estimation.fit import FEW_STEPS, FIRST_STEPS, Problem, Window
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.posterior import Prior, WindowFit
+from backlash_ros.core.estimation.score_tests import with_walk
 from backlash_ros.core.estimation.search import search
 from backlash_ros.core.law import OutOfBounds
-from backlash_ros.core.plant.backlash import engaged, play, reversals
 from backlash_ros.core.plant.transfer_function import Array
 
 
@@ -80,44 +79,6 @@ class Setup:
                 in zip(('m', 'c_r', 'c_l'), values, outside, strict=True) if out]
 
 
-class Window(NamedTuple):
-    """Samples from number `first` on: v that acted, y after it (nan: lost), v that may have acted
-    instead (nan: none), all (N,)."""
-
-    first: int
-    v: Array
-    y: Array
-    other: Array
-
-    @property
-    def end(self) -> int:
-        return self.first + len(self.v)
-
-    def between(self, first: int, end: int | None = None) -> Window:
-        """The samples from one number to before another."""
-        begin = max(first - self.first, 0)
-        part = slice(begin, None if end is None else max(end - self.first, 0))
-        return Window(self.first + begin, self.v[part], self.y[part], self.other[part])
-
-    def places(self, numbers: frozenset[int]) -> list[int]:
-        return [k - self.first for k in numbers if self.first <= k < self.end]
-
-    def swapped(self, numbers: frozenset[int]) -> Window:
-        """The same where the other command acted over the intervals of these samples."""
-        places, v, other = self.places(numbers), self.v.copy(), self.other.copy()
-        v[places], other[places] = self.other[places], self.v[places]
-        return self._replace(v=v, other=other)
-
-    def without(self, numbers: frozenset[int]) -> Window:
-        """The same without these readings."""
-        y = self.y.copy()
-        y[self.places(numbers)] = np.nan
-        return self._replace(y=y)
-
-    def turns(self, gap: float, p0: float) -> int:
-        return len(reversals(engaged(self.v, play(self.v, gap, p0), gap)))
-
-
 def afresh(
     setup: Setup, record: Window, like: WindowFit | None = None, older: Prior | None = None,
     also: WindowFit | None = None, walks: bool = False,
@@ -168,7 +129,7 @@ def afresh(
     if best.m < 0.0 or hopeless:
         return best
     best = mixed(p, p.with_intervals(best), fits)
-    return p.with_walk(best, setup.walk_std) if walks else best
+    return with_walk(p, best, setup.walk_std) if walks else best
 
 
 def mixed(p: Problem, best: WindowFit, others: Sequence[WindowFit] = ()) -> WindowFit:

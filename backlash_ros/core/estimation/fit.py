@@ -7,6 +7,8 @@ the play. The noise and the scale s are integrated out in closed form (Normal-Ga
 s, whose prior is log-normal around 1: G is about as wrong as configured.
 """
 
+from __future__ import annotations
+
 from dataclasses import replace
 from functools import cached_property
 from math import inf, isfinite, isnan, log, sqrt
@@ -15,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation import posterior, settings
+from backlash_ros.core.estimation import posterior
 from backlash_ros.core.estimation.plant_family import Family, delayed, padded, sensitivities
 from backlash_ros.core.estimation.posterior import Prior, WindowFit
 from backlash_ros.core.plant.backlash import Region, engaged, play, reversals
@@ -40,6 +42,44 @@ class Run(NamedTuple):
     likelihood: posterior.Likelihood
     weights: Array
     begins: NDArray[np.intp]
+
+
+class Window(NamedTuple):
+    """Samples from number `first` on: v that acted, y after it (nan: lost), v that may have acted
+    instead (nan: none), all (N,)."""
+
+    first: int
+    v: Array
+    y: Array
+    other: Array
+
+    @property
+    def end(self) -> int:
+        return self.first + len(self.v)
+
+    def between(self, first: int, end: int | None = None) -> Window:
+        """The samples from one number to before another."""
+        begin = max(first - self.first, 0)
+        part = slice(begin, None if end is None else max(end - self.first, 0))
+        return Window(self.first + begin, self.v[part], self.y[part], self.other[part])
+
+    def places(self, numbers: frozenset[int]) -> list[int]:
+        return [k - self.first for k in numbers if self.first <= k < self.end]
+
+    def swapped(self, numbers: frozenset[int]) -> Window:
+        """The same where the other command acted over the intervals of these samples."""
+        places, v, other = self.places(numbers), self.v.copy(), self.other.copy()
+        v[places], other[places] = self.other[places], self.v[places]
+        return self._replace(v=v, other=other)
+
+    def without(self, numbers: frozenset[int]) -> Window:
+        """The same without these readings."""
+        y = self.y.copy()
+        y[self.places(numbers)] = np.nan
+        return self._replace(y=y)
+
+    def turns(self, gap: float, p0: float) -> int:
+        return len(reversals(engaged(self.v, play(self.v, gap, p0), gap)))
 
 
 class Problem:
@@ -317,20 +357,3 @@ class Problem:
         if best.left.rms < 1.5 * f.noise:
             return best
         return self.finished(self.fitted(f.without_intervals))
-
-    def with_walk(self, f: WindowFit, least: float) -> WindowFit:
-        """The fit, or one with a larger walk of u if that explains correlated residuals."""
-        best, begin = f, replace(f.without_intervals, knots=np.zeros(0), walk_std=least)
-        if f.walk_std != least:
-            best = self.with_intervals(self.fitted(begin))
-        if not best.valid or not best.systematic:
-            return best
-        for share in (0.005, 0.02, 0.08):  # of m times the gap, by which u may walk over the record
-            walk_std = share * f.m * f.gap / sqrt(len(self.v))
-            if walk_std > least:
-                g = self.with_intervals(self.fitted(replace(begin, walk_std=walk_std), FIRST_STEPS))
-                needed = 0.0 if best.walk_std > least else settings.FAR_BEHIND
-                # Readings of which the walk leaves a correlated rest count as fewer.
-                if g.valid and g.evidence - best.evidence > needed * g.inflation:
-                    best = g
-        return best

@@ -1,4 +1,4 @@
-"""What a fit lacks, told from its residuals alone: a load that coasts, commands that were late.
+"""What a fit lacks, told from its residuals: a load that coasts, a walk of u, late commands.
 
 A load that nothing holds in the gap runs on with the speed that it had when it left its side. That
 is one more column of the fit; its coefficient kappa is 0 where the load stays and 1 where nothing
@@ -15,8 +15,8 @@ from math import log, sqrt
 
 import numpy as np
 
-from backlash_ros.core.estimation.explanations import Window
-from backlash_ros.core.estimation.fit import Problem
+from backlash_ros.core.estimation import settings
+from backlash_ros.core.estimation.fit import FIRST_STEPS, Problem, Window
 from backlash_ros.core.estimation.posterior import WindowFit
 from backlash_ros.core.plant.backlash import clamp, play
 from backlash_ros.core.plant.numerics import lfilter
@@ -58,6 +58,29 @@ def _runs_on(problem: Problem, fit: WindowFit) -> bool:
     kappa = float(s @ problem.residual(fit)[problem.known]) / squares
     # Over its standard deviation as if residuals were white: they are far from that.
     return kappa > 0.15 and kappa * squares**0.5 / max(fit.noise, fit.left.rms) > 8.0
+
+
+def with_walk(problem: Problem, f: WindowFit, least: float) -> WindowFit:
+    """The fit, or one with a larger walk of u if that explains correlated residuals."""
+    best, begin = f, replace(f.without_intervals, knots=np.zeros(0), walk_std=least)
+    if f.walk_std != least:
+        best = problem.with_intervals(problem.fitted(begin))
+    if not best.valid or not best.systematic:
+        return best
+    runs_on = _runs_on(problem, best)
+    for share in (0.005, 0.02, 0.08):  # of m times the gap, by which u may walk over the record
+        walk_std = share * f.m * f.gap / sqrt(len(problem.v))
+        if walk_std > least:
+            walks = replace(begin, walk_std=walk_std)
+            g = problem.with_intervals(problem.fitted(walks, FIRST_STEPS))
+            needed = 0.0 if best.walk_std > least else settings.FAR_BEHIND
+            # Readings of which the walk leaves a correlated rest count as fewer: as neighbours of a
+            # first-order process do, or as a single one where a load that coasts makes the rest.
+            rho = min(g.left.correlation, 0.999)
+            fewer = g.inflation if runs_on else (1.0 + rho) / (1.0 - rho)
+            if g.valid and g.evidence - best.evidence > needed * fewer:
+                best = g
+    return best
 
 
 def likelier(

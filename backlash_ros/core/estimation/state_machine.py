@@ -19,10 +19,10 @@ import numpy as np
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.estimation import settings
 from backlash_ros.core.estimation.belief import Belief, State, Trial, published, shortened
-from backlash_ros.core.estimation.explanations import Setup, Window, afresh, mixed, outliers
-from backlash_ros.core.estimation.fit import FEW_STEPS, Problem
+from backlash_ros.core.estimation.explanations import Setup, afresh, mixed, outliers
+from backlash_ros.core.estimation.fit import FEW_STEPS, Problem, Window
 from backlash_ros.core.estimation.posterior import Prior, WindowFit
-from backlash_ros.core.estimation.score_tests import coasts, likelier
+from backlash_ros.core.estimation.score_tests import coasts, likelier, with_walk
 from backlash_ros.core.estimation.settings import BLOCKS, FEWEST, MISFIT, PREDICTED, SHORT_RECORD
 
 
@@ -181,7 +181,7 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
         if short or fit.spread.any():  # else it has been normal for long
             known = other is not None and setup.is_known(other, settings.REVERSALS)
             fit = mixed(problem, fit, [other] if other is not None and known else [])
-        fit = problem.with_walk(fit, setup.walk_std)
+        fit = with_walk(problem, fit, setup.walk_std)
         after = after._replace(thorough=(record.end + 2 * count // 5, 0.5 * fit.gap_std))
     else:
         fit = problem.finished(fit)

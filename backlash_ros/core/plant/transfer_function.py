@@ -161,6 +161,9 @@ def model_warnings(
          'G(z) integrates more than once: y drifts fast while u is not yet right'),
         (circle, f'the zero {"".join(circle[:1])} lies on the unit circle: motion of u at that '
                  'frequency does not show in y'),
+        (np.linalg.cond(StateModel(model).to_observer) > 1e9,
+         'the coefficients of G(z) determine its states badly: give more digits, or a longer '
+         'sample_period'),
         (not 10.0 <= samples <= 1e5,
          f'frequency={frequency or 0.0:g} rad/s has {samples:.3g} samples per period, between 10 '
          'and 100000 are sensible: change sample_period'),

@@ -24,8 +24,8 @@ ROOMS = (
     'identification', 'driver_check',
 )
 ESTIMATION = (
-    'settings', 'plant_family', 'posterior', 'fit', 'search', 'explanations',
-    'score_tests', 'belief', 'state_machine', 'observer', 'estimator',
+    'settings', 'plant_family', 'posterior', 'fit', 'score_tests', 'search', 'explanations',
+    'belief', 'state_machine', 'observer', 'estimator',
 )
 NUMERIC = {'numpy', 'scipy'}
 ROS_SUFFIXES = ('_msgs', '_srvs', '_interfaces')
