@@ -19,7 +19,12 @@ from backlash_ros.core.identification import model as models
 from backlash_ros.core.identification import structure_search as search
 from backlash_ros.core.identification.model import VAGUE, Model, Structure, fitted, moved_to
 from backlash_ros.core.identification.not_play import Observed, limited, rate_limit
-from backlash_ros.core.identification.structure_search import Options, StructureSearch, Units
+from backlash_ros.core.identification.structure_search import (
+    Options,
+    Progress,
+    StructureSearch,
+    Units,
+)
 from backlash_ros.core.identification.verdict import CERTAIN, Findings, Verdict, judge
 from backlash_ros.core.plant.actuator import Actuator
 from backlash_ros.core.plant.transfer_function import Array
@@ -104,10 +109,12 @@ class Identification:
 
 def identify(
     v: Array, y: Array, sample_period: float, options: Options | None = None,
+    progress: Progress = lambda _: None,
 ) -> Identification:
     """Identify v (N,), applied from k to k+1, and y (N,) at k, nan where lost.
 
-    Raises ValueError for arrays that do not fit together or hold what is no number.
+    progress: is told what is being done. Raises ValueError for arrays that do not fit together or
+    hold what is no number.
     """
     options = options or Options()
     v, y = np.asarray(v, dtype=float), np.asarray(y, dtype=float)
@@ -123,9 +130,10 @@ def identify(
     units = Units(float(v.mean()), float(np.ptp(v[part])), float(np.nanmedian(y)),
                   float(np.nanstd(y[part])))
     v, y = (v - units.v) / units.v_size, (y - units.y) / units.y_size
-    s = search.searched(v[part], y[part], options, options.delays or search.EARLY)
+    s = search.searched(v[part], y[part], options, options.delays or search.EARLY, progress)
     if not options.delays:
-        s = search.later(s, options)
+        s = search.later(s, options, progress)
+    progress('fitting the whole record')
     best, samples, rows = s.best, s.samples, models.effective(s.best.left)
     structures = [replace(best.structure, delay=delay)
                   for delay in search.equal_delays(s.compared, s.chosen)]
@@ -147,6 +155,7 @@ def identify(
         best = models.least_response(best)
     s = s._replace(samples=samples, best=best, held_out=s.held_out._replace(
         first=part.start + s.held_out.first))
+    progress('judging')
     found = _as_a_gain(_described(s, given, options, units), s, options, units)
     return found if slow is None else found.with_remarks(
         f'v jumps, and the drive follows by at most {slow / sample_period:.4g} per s: the fit is '

@@ -9,7 +9,7 @@ good predictors; of these the least N' log(squares) + unknowns log(N') over all 
 (BIC), with N' = N (1 - r) / (1 + r) for the lag-1 correlation r of the residual.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from math import exp, inf, log, nan, sqrt
 from typing import NamedTuple
@@ -36,6 +36,7 @@ from backlash_ros.core.plant.numerics import lfilter
 from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.records.readings import noise_of, outliers, quantum
 
+Progress = Callable[[str], object]
 EARLY, LONGEST_DELAY = (0, 1, 2, 3), 40  # delays that are compared first, and the longest
 GENERAL_POLES = 3  # of the G with which the gap is searched first; it has a tap for each delay
 PLATEAU = 10.0  # difference of the criterion below which two delays are equally good
@@ -102,9 +103,12 @@ class StructureSearch(NamedTuple):
     apart: float
 
 
-def searched(v: Array, y: Array, options: Options, delays: Sequence[int]) -> StructureSearch:
+def searched(
+    v: Array, y: Array, options: Options, delays: Sequence[int], progress: Progress,
+) -> StructureSearch:
     """The best structure with one of these delays."""
     far_off = 0.03  # relative distance of the last gap from the first, with which to begin anew
+    progress('searching the gap')
     samples = Samples(v, y, max(delays) + 1, len(v), step_of(y))
     found = _with_general(samples, delays)
     kept = without_outliers(samples, found[0])
@@ -119,7 +123,9 @@ def searched(v: Array, y: Array, options: Options, delays: Sequence[int]) -> Str
         Structure(order, delay, integrator) for integrator in options.integrators
         for delay in delays for order in options.orders if order >= integrator]
     for again in (True, False):
+        progress('comparing orders and delays')
         compared = _compare(samples, candidates, structures, cut)
+        progress('refining')
         for _ in structures:
             chosen = selected(compared)
             models = _of_gaps(samples, chosen.whole)
@@ -334,12 +340,13 @@ def _predicted(found: Model, later: Samples) -> Array:
     return problem.at(problem.begun(begin, True)).y
 
 
-def later(early: StructureSearch, options: Options) -> StructureSearch:
+def later(early: StructureSearch, options: Options, progress: Progress) -> StructureSearch:
     """The search among later delays, where one of them explains y as well or better: the same
     structure is fitted with one sample of delay more and more, from the fit before."""
     worse_for = 3  # delays in a row that fit worse, behind which no later one is tried
     alike_by = 5.0  # log-likelihood by which a delay that fits alike may be worse
     best, latest = early.best, min(LONGEST_DELAY, len(early.samples.v) // 20)
+    progress('searching later delays')
     samples = replace(early.samples, first=latest + 1)
     scan = [fitted(samples, best.structure, best.fit)]
     alike, rows = list(scan), effective(scan[0].left)
@@ -361,7 +368,7 @@ def later(early: StructureSearch, options: Options) -> StructureSearch:
         return early
     # Poles may stand for a part of a delay: where many fit alike, it is one of the last.
     late = searched(early.samples.v, early.samples.y, options, range(
-        max(first - 1, last - 5, 0), min(last + 2, latest) + 1))
+        max(first - 1, last - 5, 0), min(last + 2, latest) + 1), progress)
     rows = effective(late.best.left)
     better = rows * log(max(best.rms, TINY) / max(late.best.rms, TINY)) + 0.5 * log(rows) * (
         best.structure.unknowns - late.best.structure.unknowns)

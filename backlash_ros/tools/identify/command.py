@@ -103,5 +103,9 @@ def _identify(args: Sequence[str] | None) -> bool:
         period = options.period or given.get('sample_period')
         record = read_record(options.record, period if isinstance(period, float) else None, span,
                              options.axis, options.columns)
+    from tqdm import tqdm
+
     from backlash_ros.tools.identify.outcome import identify_record, write_outcome
-    return write_outcome(identify_record(record, options), record, given, options)
+    with tqdm(file=sys.stderr, disable=None, leave=False, bar_format='{desc}: {elapsed}') as bar:
+        found = identify_record(record, options, bar.set_description_str)
+    return write_outcome(found, record, given, options)

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -93,6 +94,12 @@ def _follow(
     """Tell now and then what the record says, until the motion ends, is precise enough, or is to
     be stopped. It is identified beside the motion, by a thread that gives way to the driver."""
     next_look = 3.0  # [s] of motion before an estimate
+    given_up = threading.Event()
+
+    def go_on(_: str) -> None:
+        if given_up.is_set():
+            raise BrokenOffError('nobody asks for the estimate any more')
+
     estimate: Future[Identification] | None = None
     beside = ThreadPoolExecutor(1, initializer=partial(os.nice, 5))
     while child.poll() is None and not stop.count:
@@ -100,7 +107,8 @@ def _follow(
         record = next(records)
         moved = len(record.v) * record.sample_period if record else 0.0
         if record and estimate is None and moved >= next_look:
-            estimate = beside.submit(identify_record, replace(record, commands=None), options)
+            estimate = beside.submit(
+                identify_record, replace(record, commands=None), options, go_on)
         if estimate is None or not estimate.done():
             continue
         finished, estimate, next_look = estimate, None, 1.5 * next_look
@@ -112,6 +120,7 @@ def _follow(
                     found.model.response_std.max())) <= options.precision * found.gap:
                 break
     # Without waiting for it: the node is to come to rest now.
+    given_up.set()
     beside.shutdown(wait=False)
 
 

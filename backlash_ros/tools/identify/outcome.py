@@ -2,7 +2,7 @@
 
 import argparse
 import signal
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from html import escape
 from pathlib import Path
@@ -28,12 +28,14 @@ from backlash_ros.tools.runs.files import result_directory, write_summary, write
 YAML = 'identified.yaml'
 
 
-def identify_record(record: Record, options: argparse.Namespace) -> Identification:
+def identify_record(
+    record: Record, options: argparse.Namespace, progress: Callable[[str], object],
+) -> Identification:
     """Identify with what the command line says; raises BrokenOffError."""
     integrators = {'auto': (False, True), 'yes': (True,), 'no': (False,)}[options.integrator]
     try:
         found = identify(record.v, record.y, record.sample_period, Options(
-            options.order, options.delay, integrators, options.slope))
+            options.order, options.delay, integrators, options.slope), progress)
         return found if record.commands is None else with_actuator(found, record.commands)
     except np.linalg.LinAlgError as error:
         raise BrokenOffError(f'the record cannot be fitted: {error}') from error
