@@ -17,7 +17,7 @@ from backlash_ros.core.estimation import settings
 from backlash_ros.core.estimation.belief import Belief, Kept, Known
 from backlash_ros.core.estimation.explanations import Setup
 from backlash_ros.core.estimation.fit import Window
-from backlash_ros.core.estimation.observer import Following, Place, state_after
+from backlash_ros.core.estimation.observer import Following, Gain, Place, gains_of, state_after
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.state_machine import learn
 from backlash_ros.core.jobs import ChannelSamples, Executor, Failure
@@ -28,11 +28,12 @@ from backlash_ros.core.plant.transfer_function import Array, StateModel, Transfe
 
 
 class Fitted(NamedTuple):
-    """What comes of a fit: what is believed, where play and G stand, a better G if there is one."""
+    """What comes of a fit: what is believed, where play and G stand, a better G and its gains."""
 
     belief: Belief
     place: Place | None = None
     better: StateModel | None = None
+    gains: tuple[Gain, ...] = ()
 
 
 def fitted(
@@ -54,8 +55,10 @@ def fitted(
     newest = slice(-min(len(part.v), 4 * setup.family.memory, settings.ROWS), None)
     u, y = run.u[newest], part.y[newest]
     place = Place(float(run.p[-1]), u, y, model, state_after(model, u, y))
-    off = len(proposed) and belief.trusted and fit.behind(proposed) > 1.0
-    return Fitted(belief, place, StateModel(setup.family.model_at(fit.xi)) if off else None)
+    if not len(proposed) or not belief.trusted or fit.behind(proposed) <= 1.0:
+        return Fitted(belief, place)
+    better = StateModel(setup.family.model_at(fit.xi))
+    return Fitted(belief, place, better, gains_of(better))
 
 
 class MovingHorizon(Law):
@@ -83,7 +86,7 @@ class MovingHorizon(Law):
             known = Known(np.array([initial.m, initial.c_r, initial.c_l]), np.diag(std**2))
             self._belief = Belief(inherited=known, published=known)
         self._following = Following(model, observer)
-        self._proposed = model
+        self._proposed, self._gains = model, tuple[Gain, ...]()
         self._xi: Array = np.zeros(0 if initial.learned else family.count)  # of that G
         self._recording = True  # whether the newest sample was one to learn from
         self._lost_in_a_row = self._failed_fits = self._reattributed = 0
@@ -139,7 +142,7 @@ class MovingHorizon(Law):
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
     def adopt(self, model: StateModel) -> None:
-        self._following.change_model(model)
+        self._following.change_model(model, self._gains if model is self._proposed else ())
 
     def retune(self, p: Parameters) -> None:
         root = p.sample_period**0.5
@@ -204,7 +207,7 @@ class MovingHorizon(Law):
         if place is None or fit is None:
             return
         if result.better is not None:
-            self._proposed, self._xi = result.better, fit.theta[3:]
+            self._proposed, self._gains, self._xi = result.better, result.gains, fit.theta[3:]
         if not belief.trusted and following.observer is not None:
             following.observer.settle(fit.noise)  # no fit says where the state is
             return

@@ -10,6 +10,7 @@ they are (R. K. Mehra, IEEE Trans. Automatic Control 15 (1970) 175-184).
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from functools import lru_cache, partial
 from math import isnan, nan, sqrt
 from operator import mul
@@ -60,17 +61,25 @@ def gain_of(model: StateModel, ratio: float) -> Gain:
         p - np.outer(column, column) * variance, sqrt(float(c @ quiet @ c) + 1.0))
 
 
+def gains_of(model: StateModel) -> tuple[Gain, ...]:
+    """For noise on u of every size: milliseconds, for a worker."""
+    return tuple(gain_of(model, ratio) for ratio in RATIOS)
+
+
 class Observer:
     """Follows the state of G, kept in the observer form; before: that of another G for this plant.
 
-    variance: of the innovation, measured. cov: of the state as StateModel has it (n, n).
+    gains: of this G, where they are known; otherwise only the one in use is made. variance:
+    of the innovation, measured. cov: of the state as StateModel has it (n, n).
     """
 
     def __init__(
-        self, model: StateModel, noise_std: float, before: Observer | None = None,
+        self, model: StateModel, noise_std: float, gains: Sequence[Gain],
+        before: Observer | None = None,
     ) -> None:
         # Innovations are no larger than with a G from before.
-        self._model, highest = model, len(RATIOS) if before is None else before.level
+        highest = len(RATIOS) if before is None else before.level
+        self._model, self._gains = model, gains
         self._use(min(len(RATIOS) // 2, highest), noise_std)
         self.variance = (self._gain.innovation * noise_std) ** 2
         self._x = [0.0] * model.order
@@ -80,7 +89,7 @@ class Observer:
 
     def _use(self, level: int, noise_std: float) -> None:
         self.level, self.noise_std = level, noise_std
-        self._gain = gain_of(self._model, RATIOS[level])
+        self._gain = self._gains[level] if self._gains else gain_of(self._model, RATIOS[level])
         self.cov = self._gain.cov * noise_std**2
 
     @property
@@ -144,6 +153,7 @@ class Following:
 
     def __init__(self, model: StateModel, before: FixedBacklash | None) -> None:
         self.model, self.before = model, before
+        self._gains: Sequence[Gain] = ()
         self.observer: Observer | None = None
         self.u = self.innovation = nan
         self.since_motion = self.outliers = self.beyond = 0
@@ -164,12 +174,12 @@ class Following:
         none: list[float] = [0.0] * self.model.order
         return none if self.before is None else self.before.x_hat.tolist()
 
-    def change_model(self, model: StateModel) -> None:
-        self.model = model
+    def change_model(self, model: StateModel, gains: Sequence[Gain]) -> None:
+        self.model, self._gains = model, gains
         if self.before is not None:
             self.before = self.before.with_model(model)
         if self.observer is not None:
-            self.observer = Observer(model, self.observer.noise_std, self.observer)
+            self.observer = Observer(model, self.observer.noise_std, gains, self.observer)
             y = np.array(self._y)
             if np.isfinite(y).sum() > model.order:
                 x = state_after(model.transfer_function, np.array(self._u), y)
@@ -213,7 +223,7 @@ class Following:
                 and np.array_equal(other.numerator, own.numerator)):
             return  # another G was adopted meanwhile
         if self.observer is None:
-            self.observer = Observer(self.model, noise_std)
+            self.observer = Observer(self.model, noise_std, self._gains)
         else:
             self.observer.settle(noise_std)
         observer = self.observer

@@ -28,6 +28,7 @@ def coasts(problem: Problem, fit: WindowFit, known: Array | None = None) -> bool
 
     known: m, c_r, c_l (3,) from before, for the fit of a load that coasts may have next to no gap.
     """
+    named = 8.0  # kappa over its deviation, as residuals are far from white
     if not (fit.m > 0.0 and fit.systematic):
         return False
     if known is not None:
@@ -35,12 +36,13 @@ def coasts(problem: Problem, fit: WindowFit, known: Array | None = None) -> bool
         theta = np.concatenate([[m, m * c_r, c_r - c_l], fit.theta[3:]])
         p0 = float(problem.v[0]) + 0.5 * (c_r - c_l)
         there = problem.begun(replace(fit, theta=theta, p0=p0))
-        if _runs_on(problem, problem.finished(there)):
+        if _runs_on(problem, problem.finished(there)) > named:
             return True
-    return _runs_on(problem, fit)
+    return _runs_on(problem, fit) > named
 
 
-def _runs_on(problem: Problem, fit: WindowFit) -> bool:
+def _runs_on(problem: Problem, fit: WindowFit) -> float:
+    """kappa over its standard deviation, as if residuals were white; 0 for a small one."""
     v, p = problem.v, problem.at(fit).p
     beyond, speed = [0.0], 0.0  # how far a load that nothing brakes is from p
     for k, move in enumerate(np.diff(p).tolist(), 1):
@@ -54,10 +56,9 @@ def _runs_on(problem: Problem, fit: WindowFit) -> bool:
     s = column - q @ (q.T @ column)
     squares = float(s @ s)
     if squares <= 1e-12 * float(column @ column):
-        return False
+        return 0.0
     kappa = float(s @ problem.residual(fit)[problem.known]) / squares
-    # Over its standard deviation as if residuals were white: they are far from that.
-    return kappa > 0.15 and kappa * squares**0.5 / max(fit.noise, fit.left.rms) > 8.0
+    return kappa * squares**0.5 / max(fit.noise, fit.left.rms) if kappa > 0.15 else 0.0
 
 
 def with_walk(problem: Problem, f: WindowFit, least: float) -> WindowFit:
@@ -67,7 +68,7 @@ def with_walk(problem: Problem, f: WindowFit, least: float) -> WindowFit:
         best = problem.with_intervals(problem.fitted(begin))
     if not best.valid or not best.systematic:
         return best
-    runs_on = _runs_on(problem, best)
+    runs_on = _runs_on(problem, best) > settings.BY_CHANCE
     for share in (0.005, 0.02, 0.08):  # of m times the gap, by which u may walk over the record
         walk_std = share * f.m * f.gap / sqrt(len(problem.v))
         if walk_std > least:
