@@ -7,6 +7,8 @@ from functools import partial
 from math import inf
 
 from backlash_ros.core.estimate import Status
+from backlash_ros.core.loop.diagnosis import Learning, LoopFigures, Neighbours, state_beside
+from backlash_ros.core.loop.sample_counter import Timing
 from backlash_ros.core.parameters import Parameters, Value, as_yaml
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.options import OptionParser
@@ -53,9 +55,13 @@ def _once(parameters: Parameters, options: argparse.Namespace) -> None:
     run = run_loop(loop, samples)
     directory = result_directory(options.out)
     print(estimate_table(write_report(Run(run, parameters), directory)))
-    status = loop.controller.estimator.estimate.status
-    if status != Status.TRACKING:
-        print(f'at the end: {status.word}')
+    law = loop.controller.estimator
+    if law.estimate.status != Status.TRACKING:
+        state = state_beside(set(), LoopFigures(
+            timing=Timing(parameters.sample_period), around=Neighbours(),
+            learning=Learning(law.estimate.status, law.report),
+        ))
+        print(f'at the end: {state.text}')
     print(f'report: {directory / REPORT_PAGE}')
 
 
