@@ -19,7 +19,6 @@ class OptionParser(argparse.ArgumentParser):
         self._hint = hint
 
     def error(self, message: str) -> NoReturn:
-        """Say what is wrong and end the process."""
         self.exit(BAD_INPUT, f'{self.prog}: {message}{self._hint}\n')
 
 

@@ -1,14 +1,14 @@
 """Many simulated runs: seeds and sweeps as jobs, here or on a cluster, and their statistics."""
 
-import itertools
+import ctypes
 import logging
 import multiprocessing
 import os
 import signal
-import threading
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from itertools import product
 from math import inf
 from typing import NamedTuple
 
@@ -34,8 +34,7 @@ OUTCOME_COLUMNS = (
     *(f'{prefix}{name}' for prefix in OUTCOME_GROUPS for name in BACKLASH),
     'control_error_rms', 'tracking_error_rms', 'lost_samples', 'problem',
 )
-# What a run came to, under OUTCOME_COLUMNS: nothing where a number is unknown or never reached;
-# problem: why it broke off, '' where it did not.
+# What a run came to, under OUTCOME_COLUMNS; problem: why it broke off, '' where it did not.
 Outcome = Mapping[str, float | str | None]
 
 
@@ -61,20 +60,19 @@ def combinations(texts: Sequence[str]) -> list[dict[str, Value]]:
     sweeps: dict[str, list[Value]] = {}
     for text in texts:
         name, _, listed = map(str.strip, text.partition('='))
-        if not listed:
-            raise InputError(f'--sweep {text!r} must be KEY=v1,v2,...')
         if name in sweeps:
             raise InputError(f'--sweep names {name} twice')
         check_names([name])
         try:
             values = yaml.safe_load(f'[{listed}]')
         except yaml.YAMLError:
-            raise InputError(f'--sweep {text!r}: the values are no list in YAML') from None
+            values = []
+        if not values:
+            raise InputError(f'--sweep {text!r} must be KEY=v1,v2,... in YAML')
         of_words = isinstance(BY_NAME[name].default, str)
         sweeps[name] = [check_value(BY_NAME[name], str(value) if of_words else value)
                         for value in values]
-    products = itertools.product(*sweeps.values())
-    return [dict(zip(sweeps, values, strict=True)) for values in products]
+    return [dict(zip(sweeps, values, strict=True)) for values in product(*sweeps.values())]
 
 
 def make_jobs(
@@ -87,8 +85,8 @@ def make_jobs(
         changed = parameters.replaced(change)
         samples = cli.number_of_samples(changed, duration)
         build_closed_loop(changed)
-        own = [changed.seed] if 'seed' in change else seeds
-        jobs += [Job(dict(changed.replaced({'seed': seed})), samples) for seed in own]
+        jobs += [Job(dict(changed.replaced({'seed': seed})), samples)
+                 for seed in ([changed.seed] if 'seed' in change else seeds)]
     return jobs
 
 
@@ -99,9 +97,9 @@ def run_job(job: Job) -> Outcome:
         summary = summarise(run_loop(build_closed_loop(parameters), job.samples), parameters)
     except BrokenOffError as error:
         return {**dict.fromkeys(OUTCOME_COLUMNS), 'problem': str(error)}
-    known = {f'{prefix}{name}': summary[group][name]
-             for prefix, group in OUTCOME_GROUPS.items() for name in BACKLASH}
-    return {name: {**summary, **known, 'problem': ''}[name] for name in OUTCOME_COLUMNS}
+    summary |= {f'{prefix}{name}': summary[group][name]
+                for prefix, group in OUTCOME_GROUPS.items() for name in BACKLASH}
+    return {name: summary.get(name, '') for name in OUTCOME_COLUMNS}
 
 
 def run_jobs(
@@ -110,7 +108,7 @@ def run_jobs(
     """Outcomes in the order of the jobs, the same wherever they were computed.
 
     workers: None takes one process per processor, 1 none besides this one. cluster: address of a
-    Dask scheduler, whose workers are used instead. Call it from the main thread.
+    Dask scheduler, whose workers are used instead.
     """
     workers = min(workers or len(os.sched_getaffinity(0)), len(jobs))
     finished = _on_cluster(jobs, cluster) if cluster is not None else \
@@ -146,14 +144,7 @@ def _in_processes(jobs: Sequence[Job], workers: int) -> Iterator[Outcome]:
 
 
 def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def watch() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
 
 
 def _on_cluster(jobs: Sequence[Job], address: str) -> Iterator[Outcome]:

@@ -73,10 +73,9 @@ def number_of_samples(parameters: Parameters, duration: float | None) -> int:
     """Length of a run: duration [s] if given, else the parameter samples, else 10 s."""
     if duration is None and parameters.samples > 0:
         return parameters.samples
-    duration = 10.0 if duration is None else duration
+    duration, period = 10.0 if duration is None else duration, parameters.sample_period
     if not 0.0 < duration < inf:
         raise InputError(f'--duration={duration!r} must be finite and > 0')
-    period = parameters.sample_period
     samples = round(duration / period)
     # It may miss a whole number by rounding alone.
     if samples < 1 or abs(duration / period - samples) > 1e-6 * samples:
@@ -98,18 +97,13 @@ def run_tool(
     atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
     try:
         return tool(args) or DONE
-    except (ParameterError, InputError) as error:
-        message, code = str(error), BAD_INPUT
     except SystemExit as ended:
         return int(ended.code or DONE)  # the parser of the options has said why
-    except KeyboardInterrupt:
-        message, code = 'interrupted', FAILED
-    except (BrokenOffError, OSError) as error:
-        message, code = str(error), FAILED
+    except (ParameterError, InputError, BrokenOffError, OSError, KeyboardInterrupt) as error:
+        print(f'{name}: {str(error) or "interrupted"}', file=sys.stderr)
+        return BAD_INPUT if isinstance(error, (ParameterError, InputError)) else FAILED
     finally:
         signal.signal(signal.SIGTERM, handler)
-    print(f'{name}: {message}', file=sys.stderr)
-    return code
 
 
 def print_warnings(name: str, parameters: Parameters) -> None:
@@ -125,8 +119,7 @@ def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
     return '\n'.join(
         '  '.join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip()
-        for row in (header, *rows)
-    )
+        for row in (header, *rows))
 
 
 def number(value: float | None, digits: int = 4, unit: str = '', scale: float = 1.0) -> str:

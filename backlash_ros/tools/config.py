@@ -40,7 +40,6 @@ class Section(NamedTuple):
     values: Mapping[str, Value]
 
     def is_for(self, *axes: str) -> bool:
-        """Whether it belongs to one of the axes, or to the whole run."""
         return self.axis in (ANY, *axes) or (self.node == BRINGUP and not self.axis)
 
 
@@ -82,7 +81,7 @@ class Configuration:
         return Parameters(values)
 
     def given(self, axis: str = '') -> dict[str, Value]:
-        """Values of the file for an axis, by flat name; raises InputError for none of them."""
+        """Values of the file for an axis, by flat name."""
         if self.axes and not axis:
             raise InputError(f'{self.path}: holds the axes {", ".join(self.axes)} and only one can '
                              f'be used here: choose it, like --axis {self.axes[0]}')
@@ -139,7 +138,6 @@ def parse_setting(text: str) -> Setting:
 
 
 def _no_such_axis(axis: str, axes: Sequence[str]) -> str:
-    """What is wrong with the name of an axis, and the nearest one that exists."""
     if not axes:
         return f'there is no axis {axis!r}: list it in the parameter axes under /{BRINGUP}'
     near = difflib.get_close_matches(axis, axes, n=1, cutoff=0.0)[0]

@@ -55,12 +55,10 @@ def label(axes: Axes, title: str = '', y: str = '', x: str = '') -> None:
 
 
 def legend_above(axes: Axes) -> None:
-    """Put the legend in one row above the axes, at the right, beside the title."""
     axes.legend(loc='lower right', bbox_to_anchor=(1.0, 1.0), ncol=9, borderaxespad=0.1)
 
 
 def legend_below(figure: Figure, axes: Axes) -> None:
-    """Put the legend of axes below all axes of the figure."""
     figure.legend(*axes.get_legend_handles_labels(), loc='outside lower center', ncol=3)
 
 
@@ -73,7 +71,6 @@ def curve(
 
 
 def zero_line(axes: Axes) -> None:
-    """Draw a thin line at y = 0."""
     axes.axhline(0.0, color='#444444', linewidth=0.8)
 
 
@@ -85,7 +82,6 @@ def band(axes: Axes, t: Array, low: Array, high: Array, colour: str, name: str =
 
 
 def shade(axes: Axes, t: Array, where: NDArray[np.bool_], name: str) -> None:
-    """Shade the times for which `where` holds."""
     axes.fill_between(t, 0, 1, where=where.tolist(), transform=axes.get_xaxis_transform(),
                       step='post', color='#bbbbbb', alpha=0.4, linewidth=0, label=name)
 
@@ -229,7 +225,6 @@ def draw_output(run: RunRecord, end: Part, y_m: Array, delay: float, followed: b
 
 
 def draw_input(run: RunRecord, parts: Sequence[Part]) -> Figure:
-    """Desired and true input of G, and the control v that causes it."""
     t = run.column('t')
     figure, grid = draw_panels(5.6, {
         'input of G [unit of u]': [(t, run.column('u'), HUES['u'], 'u', '-', 1.6),
@@ -269,7 +264,6 @@ def draw_error_curves(loops: Sequence[ErrorCurves], window_s: float) -> Figure:
 
 
 def draw_log(run: RunRecord) -> Figure:
-    """v and y of a log over time, and over each other."""
     figure = new_figure(6.0)
     rooms = figure.subplot_mosaic('ac;bc', width_ratios=(2.0, 1.0))
     for room, x, y in (('a', 't', 'v'), ('b', 't', 'y'), ('c', 'v', 'y')):

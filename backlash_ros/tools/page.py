@@ -41,7 +41,6 @@ def page(
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table of cells that are HTML."""
     head = ''.join(f'<th>{cell}</th>' for cell in header)
     return f'<table><thead><tr>{head}</tr></thead><tbody>{_body(rows)}</tbody></table>'
 

@@ -109,7 +109,6 @@ def _replayed(source: Source) -> RunRecord:
 
 
 def _one(source: Source, out: Path | None) -> None:
-    """What `simulate` writes, a figure beside it, and where the replay parts from the run."""
     recorded = source.recorded
     cli.print_warnings('replay', source.parameters)
     replayed = _replayed(source)

@@ -106,7 +106,6 @@ def _figures(
 
 
 def headline(summary: Mapping[str, Any]) -> str:
-    """The outcome in one sentence of HTML."""
     if summary['final']['m'] is None or not np.isfinite(summary['final']['m']):
         return 'A log of v and y, which no controller has estimated anything from: ' \
                '<code>identify</code> tells its backlash, <code>replay</code> what a controller ' \

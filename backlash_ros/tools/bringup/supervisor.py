@@ -133,7 +133,6 @@ class Child:
                     log.write(line)
 
     def describe_end(self, what: str, further: str = '') -> str:
-        """What became of it, how it exited, and the end of its log."""
         code = self.process.returncode
         end = f'killed by {signal.Signals(-code).name}' if code < 0 else f'exit code {code}'
         return f'{self.name} {what} ({end}){further}, the end of {self.end_of_log()}'

@@ -80,7 +80,6 @@ class AxisProgress:
             complain(self.plan.titled('  '.join(words)), '')
 
     def check_pace(self) -> None:
-        """Raise BrokenOffError for samples that do not come."""
         now, p, failure = time.monotonic(), self.plan.parameters, ''
         at = f' after sample {self.first + self.made - 1}' if self.made else ''
         silence = f'no new sample for {self.patience:g} s{at}'
@@ -239,7 +238,6 @@ def run(plan: RunPlan, requests: StopRequests) -> RunWatch:
 
 
 def report(axis: AxisPlan) -> bool:
-    """Write and print what came out of an axis; returns whether that worked."""
     # Drawing libraries take a second to load: not before bad input is refused.
     from backlash_ros.tools.report import REPORT_PAGE, write_report
     from backlash_ros.tools.runs.read_run import read_run
@@ -257,7 +255,7 @@ def report(axis: AxisPlan) -> bool:
             complain(axis.titled(f'no report: {error}'))
             good = False
             continue
-        print(estimate_table(summary, '/'.join(filter(None, (axis.name, joint)))))
+        print(estimate_table(summary, joint or axis.name))
         latency = summary['loop_latency_ms']
         print(f'{summary["samples"]} samples, {summary["lost_samples"]} lost', *(
             f'y to v within {latency[each]:.2f} ms ({each})' for each in latency or ()), sep=', ')
