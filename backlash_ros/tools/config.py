@@ -13,18 +13,8 @@ from typing import Any, NamedTuple
 import yaml
 
 from backlash_ros.atomic_file import write_atomically
-from backlash_ros.core.parameters import (
-    BRINGUP,
-    BY_NAME,
-    CONTROLLER,
-    NODES,
-    ParameterError,
-    Parameters,
-    Value,
-    check_names,
-    check_value,
-    entry_of,
-)
+from backlash_ros.core import parameters as catalogue
+from backlash_ros.core.parameters import BRINGUP, BY_NAME, ParameterError, Parameters, Value
 from backlash_ros.options import find_config
 from backlash_ros.tools.cli import InputError
 
@@ -127,14 +117,14 @@ def parse_setting(text: str) -> Setting:
     axis, slash, name = key.strip().rpartition('/')
     if not equals or (slash and not axis):
         raise InputError(f'--set {text!r} must be KEY=VALUE or AXIS/KEY=VALUE')
-    check_names([name])
+    catalogue.check_names([name])
     if axis and name == 'axes':
         raise ParameterError(name, given, 'is for the whole run', 'write --set axes=...')
     try:
         value = given if isinstance(BY_NAME[name].default, str) else yaml.safe_load(given)
     except yaml.YAMLError:
         raise ParameterError(name, given, 'is not a value in YAML') from None
-    return Setting(axis, name, check_value(BY_NAME[name], value))
+    return Setting(axis, name, catalogue.check_value(BY_NAME[name], value))
 
 
 def _no_such_axis(axis: str, axes: Sequence[str]) -> str:
@@ -207,18 +197,18 @@ def _checked(name: str, values: Mapping[str, object], joints: Sequence[str]) -> 
     axis, _, node = name.removeprefix('/').rpartition('/')
     if name == f'/{ANY}':
         axis = ANY
-    elif '/' in axis or not (node in NODES or (node == ANY and axis not in ('', ANY))):
-        known = [f'/{ANY}', *(f'/{each}' for each in NODES)]
-        similar = [*known, *(f'/{axis}/{each}' for each in (*NODES, ANY))]
+    elif '/' in axis or not (node in catalogue.NODES or (node == ANY and axis not in ('', ANY))):
+        known = [f'/{ANY}', *(f'/{each}' for each in catalogue.NODES)]
+        similar = [*known, *(f'/{axis}/{each}' for each in (*catalogue.NODES, ANY))]
         near = difflib.get_close_matches(name, similar, n=1)
         raise InputError(f'section {name!r} is none of {", ".join(known)}, /AXIS/{ANY}, '
-                         f'/AXIS/{CONTROLLER} ...' + ''.join(f': did you mean {n}?' for n in near))
+                         '/AXIS/controller ...' + ''.join(f': did you mean {n}?' for n in near))
     Parameters({'joints': joints, **values})  # checks all names and values
     checked = {}
     for key, value in values.items():
-        entry = entry_of(key)
+        entry = catalogue.entry_of(key)
         assert entry is not None
-        checked[key] = check_value(entry, value)
+        checked[key] = catalogue.check_value(entry, value)
         if node not in (ANY, *entry.used_by):
             raise ParameterError(key, checked[key], f'is not a parameter of {node}',
                                  f'put it under /{ANY} or /{entry.used_by[0]}')
@@ -249,7 +239,7 @@ def config_text(parameters: Parameters) -> str:
     for joint in parameters.joints:
         of_joint = parameters.of_joint(joint)
         of_all[joint] = _tree(of_joint, (
-            p.name for p in common if CONTROLLER in p.used_by and not p.per_node
+            p.name for p in common if catalogue.CONTROLLER in p.used_by and not p.per_node
             and of_joint[p.name] != parameters[p.name]))
     document = {f'/{ANY}': {'ros__parameters': of_all}}
     if own:

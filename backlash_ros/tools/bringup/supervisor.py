@@ -89,7 +89,8 @@ class Child:
     """A process, from plan to end. axis: that its events are about.
 
     foreign: no node of this package, which tells nothing but by its log. spectator: the run goes on
-    without it. settle_s: passes before it is stopped. grace_s: beyond the usual time for its end.
+    without it, once it is gone. settle_s: passes before it is stopped. grace_s: beyond the usual
+    time for its end. ready: it has said so.
     """
 
     name: str
@@ -101,6 +102,8 @@ class Child:
     spectator: bool = False
     settle_s: float = 0.0
     grace_s: float = 0.0
+    ready: bool = False
+    gone: bool = False
     process: subprocess.Popen[bytes] = field(init=False)
 
     def start(self) -> None:

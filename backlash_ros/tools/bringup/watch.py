@@ -17,7 +17,6 @@ from backlash_ros.tools.cli import BrokenOffError, InputError, StopRequests, num
 from backlash_ros.tools.runs.files import BAG
 
 START_DEADLINE_S = 30.0  # for the start of every process, and the first sample of a driver
-LATE_DEADLINE_S = 10.0  # that a run in real time may take longer than it should
 
 
 def complain(message: str, name: str = 'bringup: ') -> None:
@@ -80,28 +79,22 @@ class AxisProgress:
             complain(self.plan.titled('  '.join(words)), '')
 
     def check_pace(self) -> None:
-        now, p, failure = time.monotonic(), self.plan.parameters, ''
-        at = f' after sample {self.first + self.made - 1}' if self.made else ''
-        silence = f'no new sample for {self.patience:g} s{at}'
-        if self.complete or (p.driver == ELSEWHERE and self.made == 0):
+        p = self.plan.parameters
+        awaited = bool(p.driver) and self.made == 0
+        patience = START_DEADLINE_S if awaited else self.patience
+        if self.complete or self.silent or time.monotonic() < self.moved + patience \
+                or (awaited and p.driver == ELSEWHERE):
             return
-        if p.driver and self.made == 0:
-            if now > self.began + START_DEADLINE_S:
-                failure = (f'no sample within {START_DEADLINE_S:g} s: does the driver publish its '
-                           'output? Where it needs longer, start it yourself (--driver none)')
-        elif p.samples and not p.lockstep and \
-                now > self.began + p.samples * p.sample_period + LATE_DEADLINE_S:
-            failure = (f'only {self.made} of {p.samples} samples, {LATE_DEADLINE_S:g} s after the '
-                       'end was due')
-        elif now > self.moved + self.patience:
+        at = f' after sample {self.first + self.made - 1}' if self.made else ''
+        silence = f'no new sample for {patience:g} s{at}'
+        if p.driver and self.made:
             # The controller knows what to do when a real plant falls silent.
-            if not p.driver:
-                failure = silence
-            elif not self.silent:
-                self.silent = True
-                complain(self.plan.titled(f'{silence}, waiting for the driver'))
-        if failure:
-            raise BrokenOffError(self.plan.titled(f'{failure}, see {self.plan.logs}'))
+            self.silent = True
+            complain(self.plan.titled(f'{silence}, waiting for the driver'))
+            return
+        cure = ': does the driver publish its output? Where it needs longer, start it yourself ' \
+               '(--driver none)' if p.driver else ''
+        raise BrokenOffError(self.plan.titled(f'{silence}{cure}, see {self.plan.logs}'))
 
 
 class RunWatch:
@@ -112,8 +105,6 @@ class RunWatch:
     ) -> None:
         self._supervisor, self._requests = supervisor, requests
         self.axes = {axis.name: AxisProgress(axis) for axis in plan.axes}
-        self._ready: set[str] = set()
-        self._gone: set[str] = set()  # spectators that have died
         self.failure = ''
 
     def execute(self) -> None:
@@ -142,8 +133,7 @@ class RunWatch:
         for child in self._supervisor.children if not self.failure else ():
             code = child.process.returncode
             # How a program of the user says good-bye is its own affair.
-            if code and child.name not in self._gone and (
-                    not child.foreign or code == -signal.SIGKILL):
+            if code and not child.gone and (not child.foreign or code == -signal.SIGKILL):
                 self._fail(child.describe_end('did not stop cleanly'))
 
     def _fail(self, failure: str) -> None:
@@ -160,7 +150,7 @@ class RunWatch:
     def _wait_until_ready(self) -> None:
         deadline = time.monotonic() + START_DEADLINE_S
         while missing := [child for child in self._supervisor.children
-                          if not child.foreign and child.name not in self._ready]:
+                          if not (child.foreign or child.ready)]:
             late = [child for child in missing if not self.axes[child.axis].plan.waits]
             if late and time.monotonic() > deadline:
                 hint = ' (a controller waits until the driver subscribes to its command)' \
@@ -178,10 +168,10 @@ class RunWatch:
             raise BrokenOffError(f'interrupted by {self._requests.last}, stopping')
         dead = []
         for child in self._supervisor.children:
-            if child.process.poll() is None or child.name in self._gone:
+            if child.process.poll() is None or child.gone:
                 continue
-            if child.spectator and child.name in self._ready:
-                self._gone.add(child.name)
+            if child.spectator and child.ready:
+                child.gone = True
                 complain(child.describe_end('died', ', the run goes on without it'))
             else:
                 dead.append(child.describe_end('died'))
@@ -192,7 +182,7 @@ class RunWatch:
         for child, content in events:
             axis, kind = self.axes[child.axis], content['event']
             if kind == 'ready':
-                self._ready.add(child.name)
+                child.ready = True
                 if 'address' in content:
                     print(f'{child.name}: {content["address"]}', flush=True)
             elif kind == 'done':
