@@ -16,7 +16,7 @@ from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.options import OptionParser
 from backlash_ros.tools import cli, figures
 from backlash_ros.tools.cli import NOTHING, number
-from backlash_ros.tools.config import write_config
+from backlash_ros.tools.config import config_text
 from backlash_ros.tools.figures import png
 from backlash_ros.tools.page import Picture, facts, page, table
 from backlash_ros.tools.records.reading import read_run_or_log
@@ -44,8 +44,8 @@ def write_report(run: files.Run, out: Path) -> dict[str, Any]:
     files.write_summary(summary, out / 'summary.json')
     folded = None
     if run.parameters is not None:
-        write_config(run.parameters, out / files.CONFIG_FILE)
-        folded = ('Parameters of this run', (out / files.CONFIG_FILE).read_text(encoding='utf-8'))
+        folded = 'Parameters of this run', config_text(run.parameters)
+        write_atomically(out / files.CONFIG_FILE, folded[1])
     pictures = list(_figures(run.record, run.parameters, summary))
     for picture in pictures:
         write_atomically(out / picture.name, picture.data)

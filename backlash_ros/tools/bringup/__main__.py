@@ -23,7 +23,6 @@ environment: unless you set them yourself,
 """
 
 import argparse
-import signal
 import sys
 from collections.abc import Sequence
 from functools import partial
@@ -53,8 +52,6 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def _bringup(arguments: Sequence[str] | None) -> int:
-    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
     options = parse_options(arguments)
     with StopRequests() as requests:
         # numpy and scipy take a second to load, in which a Ctrl-C is to be heard already.

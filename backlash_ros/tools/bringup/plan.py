@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
+from typing import NamedTuple
 
 from backlash_ros.core.assembly import build_controller, build_plant, build_reference
 from backlash_ros.core.parameters import ParameterError, Parameters
@@ -48,12 +49,10 @@ class AxisPlan:
         return f'{self.name}/{node}' if self.name else node
 
 
-@dataclass(frozen=True)
-class RunPlan:
+class RunPlan(NamedTuple):
     """The controllers of a run. live_port: of the page in the browser, 0 for a free one."""
 
     axes: tuple[AxisPlan, ...]
-    out: Path
     live_port: int | None = None
 
 
@@ -92,7 +91,7 @@ def prepare(options: argparse.Namespace) -> RunPlan:
     for axis in axes:
         axis.logs.mkdir(parents=True, exist_ok=True)
         write_config(axis.parameters, axis.out / CONFIG_FILE)
-    return RunPlan(axes, out, 0 if options.live and not options.live_port else options.live_port)
+    return RunPlan(axes, 0 if options.live and not options.live_port else options.live_port)
 
 
 def _checked(p: Parameters, axis: str, options: argparse.Namespace) -> Parameters:
@@ -153,14 +152,12 @@ def plan_processes(plan: RunPlan, domain: int | None) -> list[list[Child]]:
         if p.driver and p.driver != ELSEWHERE:
             served.setdefault(p.driver, []).append(axis)
     for command, axes in served.items():
-        name, log = axes[0].process_name('driver'), axes[0].logs / 'driver.log'
+        name, logs = axes[0].process_name('driver'), axes[0].logs
         if len(axes) > 1:
-            names = [axis.name for axis in axes]
-            name, log = f'driver of {", ".join(names)}', plan.out / f'logs/{"_".join(names)}.log'
-            log.parent.mkdir(exist_ok=True)
+            name = f'driver of {", ".join(axis.name for axis in axes)}'
         stages[1].append(Child(
-            name, tuple(shlex.split(command)), log,
-            foreign_environment(child_environment(log.parent, domain)), foreign=True,
+            name, tuple(shlex.split(command)), logs / 'driver.log',
+            foreign_environment(child_environment(logs, domain)), foreign=True,
             # The last command of the controller acts from the next sample of the driver on.
             settle_s=min(2.0 * max(axis.parameters.sample_period for axis in axes), 1.0)))
     if plan.live_port is not None:

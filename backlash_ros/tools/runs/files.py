@@ -87,7 +87,6 @@ def write_run(run: RunRecord, directory: Path) -> None:
 
 
 def _rows_of(names: Sequence[str], cells: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rows of a record from some of its columns; what they lack is unknown."""
     rows = np.full((len(cells), len(COLUMNS)), np.nan)
     for name, column in zip(names, cells.T, strict=True):
         if name in COLUMNS:
@@ -122,12 +121,12 @@ def read_samples(path: Path, sample_period: float | None = None) -> RunRecord:
         raise InputError(f'{path}: line 1: must be the header {",".join(SAMPLE_COLUMNS)}')
     if cells.shape[1:] != (len(names),):
         raise InputError(f'{path}: must hold rows of {len(names)} numbers')
-    rows = _rows_of(names, cells)
-    t = rows[:, COLUMNS.index('t')]
+    t = cells[:, 0]
     steps = np.diff(t)
     if falls := np.flatnonzero(~(steps > 0.0)).tolist():
         raise InputError(f'{path}: line {falls[0] + 3}: t must rise from row to row')
     if sample_period is None and not len(steps):
         raise InputError(f'{path}: needs two samples to tell the sample period')
     period = sample_period or float(steps.min())
-    return RunRecord(rows, period, max(round((t[-1] - t[0]) / period) + 1 - len(t), 0))
+    lost = max(round((t[-1] - t[0]) / period) + 1 - len(t), 0)
+    return RunRecord(_rows_of(names, cells), period, lost)

@@ -47,13 +47,10 @@ def read_run(
     period = parameters.sample_period if parameters else None
     if bag := find_bag(path):
         return replace(read_bag(bag, period, span, axis), parameters=parameters)
-    inside = (path / name for name in (RECORD_FILE, SAMPLES_FILE) if (path / name).is_file())
-    file = next(inside, None) if path.is_dir() else path
-    if file is None:
+    inside = (path / RECORD_FILE, path / SAMPLES_FILE)
+    file = next(filter(Path.is_file, inside), path)
+    if not file.is_file() or file.suffix not in ('.npz', '.csv'):
         raise InputError(f'{path}: holds no bag, no {RECORD_FILE} and no {SAMPLES_FILE}')
-    if file.suffix not in ('.npz', '.csv'):
-        raise InputError(f'{path}: is neither a bag (its folder, .mcap or .db3) nor a folder of '
-                         f'results, {RECORD_FILE} or {SAMPLES_FILE}')
     record = files.read_record(file) if file.suffix == '.npz' else files.read_samples(file, period)
     if span == WHOLE_SPAN:
         return Run(record, parameters)

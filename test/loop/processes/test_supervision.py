@@ -62,7 +62,7 @@ def watch(
             )] for name, program in programs.items()
         ]
         with ProcessSupervisor(stages, lambda: hurry) as supervisor:
-            run = watching.RunWatch(RunPlan((axis,), tmp_path), supervisor, StopRequests())
+            run = watching.RunWatch(RunPlan((axis,)), supervisor, StopRequests())
             run.execute()
         return Watched(run.failure, capsys.readouterr().err, mark)
 

@@ -93,7 +93,7 @@ def plan(folder: Path, driver: str, *names: str, **values: object) -> RunPlan:
     parameters = effective_parameters(None).replaced({'driver': driver, **values})
     return RunPlan(tuple(
         AxisPlan(name, parameters, folder / name, record=True) for name in names or ('',)
-    ), folder)
+    ))
 
 
 def names_of(stages: list[list[Child]]) -> list[list[str]]:
@@ -121,7 +121,7 @@ def test_axes_with_the_same_command_share_one_driver(tmp_path: Path) -> None:
         ['x/controller', 'y/controller'], ['driver of x, y'], ['x/reference', 'y/reference'],
         ['x/recorder', 'y/recorder'],
     ]
-    assert stages[1][0].log == tmp_path / 'logs' / 'x_y.log'
+    assert stages[1][0].log == tmp_path / 'x' / 'logs' / 'driver.log'
 
 
 def test_foreign_program_gets_no_variables_that_were_made_for_this_python() -> None:
