@@ -1,8 +1,7 @@
 """The default law: it records samples, lets fits be made elsewhere, and publishes what they say.
 
-Moving-horizon estimation of the gap, the slope, the crossings, the error of G, the noise and the
-state of G at once (C. V. Rao, J. B. Rawlings, D. Q. Mayne, Constrained state estimation for
-nonlinear discrete-time systems, IEEE Trans. Automatic Control 48 (2003) 246-258).
+Moving-horizon estimation of backlash, G, its state and the noise at once (C. V. Rao, J. B.
+Rawlings, D. Q. Mayne, IEEE Trans. Automatic Control 48 (2003) 246-258).
 """
 
 from dataclasses import replace
@@ -27,13 +26,20 @@ from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.transfer_function import Array, StateModel, TransferFunction
 
 
+class Proposal(NamedTuple):
+    """A G that was learned, its xi (K,), () if it is to be left, and the gains of its observer."""
+
+    model: StateModel
+    xi: Array
+    gains: tuple[Gain, ...] = ()
+
+
 class Fitted(NamedTuple):
-    """What comes of a fit: what is believed, where play and G stand, a better G and its gains."""
+    """What comes of a fit: what is believed, where play and G stand, a better G if there is one."""
 
     belief: Belief
     place: Place | None = None
-    better: StateModel | None = None
-    gains: tuple[Gain, ...] = ()
+    better: Proposal | None = None
 
 
 def fitted(
@@ -58,7 +64,7 @@ def fitted(
     if not len(proposed) or not belief.trusted or fit.behind(proposed) <= 1.0:
         return Fitted(belief, place)
     better = StateModel(setup.family.model_at(fit.xi))
-    return Fitted(belief, place, better, gains_of(better))
+    return Fitted(belief, place, Proposal(better, fit.theta[3:], gains_of(better)))
 
 
 class MovingHorizon(Law):
@@ -86,8 +92,7 @@ class MovingHorizon(Law):
             known = Known(np.array([initial.m, initial.c_r, initial.c_l]), np.diag(std**2))
             self._belief = Belief(inherited=known, published=known)
         self._following = Following(model, observer)
-        self._proposed, self._gains = model, tuple[Gain, ...]()
-        self._xi: Array = np.zeros(0 if initial.learned else family.count)  # of that G
+        self._proposed = Proposal(model, np.zeros(0 if initial.learned else family.count))
         self._recording = True  # whether the newest sample was one to learn from
         self._lost_in_a_row = self._failed_fits = self._reattributed = 0
         self._skipping_fit = False  # whether the fit under way is of a record that was given up
@@ -111,11 +116,12 @@ class MovingHorizon(Law):
 
     @property
     def proposal(self) -> StateModel | None:
-        return None if self._proposed is self._following.model else self._proposed
+        proposed = self._proposed.model
+        return None if proposed is self._following.model else proposed
 
     @property
     def learned_model(self) -> StateModel:
-        return self._proposed
+        return self._proposed.model
 
     @property
     def report(self) -> LawReport:
@@ -142,7 +148,8 @@ class MovingHorizon(Law):
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
     def adopt(self, model: StateModel) -> None:
-        self._following.change_model(model, self._gains if model is self._proposed else ())
+        proposed = self._proposed
+        self._following.change_model(model, proposed.gains if model is proposed.model else ())
 
     def retune(self, p: Parameters) -> None:
         root = p.sample_period**0.5
@@ -186,8 +193,8 @@ class MovingHorizon(Law):
         if channel.busy or not due or not self.adapting or resting:
             return
         following.beyond += following.surprised  # once
-        channel.submit(fitted, setup, self._belief, following.model.transfer_function, self._xi,
-                       since=self._belief.kept.first)
+        channel.submit(fitted, setup, self._belief, following.model.transfer_function,
+                       self._proposed.xi, since=self._belief.kept.first)
         self._take(channel.poll())
 
     def _take(self, result: Fitted | Failure | None) -> None:
@@ -207,7 +214,7 @@ class MovingHorizon(Law):
         if place is None or fit is None:
             return
         if result.better is not None:
-            self._proposed, self._gains, self._xi = result.better, result.gains, fit.theta[3:]
+            self._proposed = result.better
         if not belief.trusted and following.observer is not None:
             following.observer.settle(fit.noise)  # no fit says where the state is
             return

@@ -7,8 +7,6 @@ the play. The noise and the scale s are integrated out in closed form (Normal-Ga
 s, whose prior is log-normal around 1: G is about as wrong as configured.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cached_property
 from math import inf, isfinite, isnan, log, sqrt
@@ -57,7 +55,7 @@ class Window(NamedTuple):
     def end(self) -> int:
         return self.first + len(self.v)
 
-    def between(self, first: int, end: int | None = None) -> Window:
+    def between(self, first: int, end: int | None = None) -> 'Window':
         """The samples from one number to before another."""
         begin = max(first - self.first, 0)
         part = slice(begin, None if end is None else max(end - self.first, 0))
@@ -66,13 +64,13 @@ class Window(NamedTuple):
     def places(self, numbers: frozenset[int]) -> list[int]:
         return [k - self.first for k in numbers if self.first <= k < self.end]
 
-    def swapped(self, numbers: frozenset[int]) -> Window:
+    def swapped(self, numbers: frozenset[int]) -> 'Window':
         """The same where the other command acted over the intervals of these samples."""
         places, v, other = self.places(numbers), self.v.copy(), self.other.copy()
         v[places], other[places] = self.other[places], self.v[places]
         return self._replace(v=v, other=other)
 
-    def without(self, numbers: frozenset[int]) -> Window:
+    def without(self, numbers: frozenset[int]) -> 'Window':
         """The same without these readings."""
         y = self.y.copy()
         y[self.places(numbers)] = np.nan

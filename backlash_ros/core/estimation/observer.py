@@ -62,15 +62,13 @@ def gain_of(model: StateModel, ratio: float) -> Gain:
 
 
 def gains_of(model: StateModel) -> tuple[Gain, ...]:
-    """For noise on u of every size: milliseconds, for a worker."""
-    return tuple(gain_of(model, ratio) for ratio in RATIOS)
+    return tuple(gain_of(model, ratio) for ratio in RATIOS)  # milliseconds, too many for the loop
 
 
 class Observer:
     """Follows the state of G, kept in the observer form; before: that of another G for this plant.
 
-    gains: of this G, where they are known; otherwise only the one in use is made. variance:
-    of the innovation, measured. cov: of the state as StateModel has it (n, n).
+    gains: of this G, if known. variance: of the innovation. cov: of StateModel's state (n, n).
     """
 
     def __init__(

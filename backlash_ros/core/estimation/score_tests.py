@@ -75,8 +75,7 @@ def with_walk(problem: Problem, f: WindowFit, least: float) -> WindowFit:
             walks = replace(begin, walk_std=walk_std)
             g = problem.with_intervals(problem.fitted(walks, FIRST_STEPS))
             needed = 0.0 if best.walk_std > least else settings.FAR_BEHIND
-            # Readings of which the walk leaves a correlated rest count as fewer: as neighbours of a
-            # first-order process do, or as a single one where a load that coasts makes the rest.
+            # Correlated readings count as a first-order process, or as one if a load coasts.
             rho = min(g.left.correlation, 0.999)
             fewer = g.inflation if runs_on else (1.0 + rho) / (1.0 - rho)
             if g.valid and g.evidence - best.evidence > needed * fewer:

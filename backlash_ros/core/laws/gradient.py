@@ -28,6 +28,21 @@ from backlash_ros.core.plant.numerics import FourBlocks
 from backlash_ros.core.plant.transfer_function import Array
 
 
+class Filters:
+    """W of phi and of u_d, and what returns of y, side by side in observer form."""
+
+    def __init__(self, blocks: FourBlocks) -> None:
+        models = [*[blocks.disturbance.state_space()] * 4, blocks.returned.state_space()]
+        self.a, self.b = models[0][0], np.column_stack([b for _, b, _ in models])
+        self.x: Array = np.zeros(self.b.shape)
+
+    def step(self, inputs: Array) -> Array:
+        """Outputs (5,) after phi, u_d and y (5,)."""
+        self.x = self.a @ self.x + self.b * inputs
+        row: Array = self.x[0]
+        return row
+
+
 class GradientEstimator(Law):
     """Learns (m, m c_r, m c_l) from y behind the filters of the four-block loop.
 
@@ -43,10 +58,7 @@ class GradientEstimator(Law):
         self.estimate, self.step = initial, step
         self._bounds, self._noise_square = bounds, (10.0 * noise_std) ** 2
         self._agreement = Agreement()
-        # W of phi and of u_d, and what returns of y, side by side in observer form.
-        models = [*[blocks.disturbance.state_space()] * 4, blocks.returned.state_space()]
-        self._a, self._b = models[0][0], np.column_stack([b for _, b, _ in models])
-        self._x: Array = np.zeros(self._b.shape)
+        self._filters = Filters(blocks)
         self._y = 0.0  # the newest one, or what was expected of it
         self._phi: Array = np.zeros(3)
         self._means = [0.0, 0.0, 0.0]  # of v^2, u_d^2 and zeta' P zeta
@@ -57,9 +69,9 @@ class GradientEstimator(Law):
         self._phi = self._engaged(interval, old)
         theta = np.array([old.m, old.m * old.c_r, old.m * old.c_l])
         self.u_hat = float(theta @ self._phi)
-        inputs = np.concatenate((self._phi, (interval.u_d, self._y)))
-        self._x = self._a @ self._x + self._b * inputs
-        zeta, demanded, returned = self._x[0, :3], self._x[0, 3], float(self._x[0, 4])
+        *of_phi, demanded, returned = self._filters.step(
+            np.concatenate((self._phi, (interval.u_d, self._y)))).tolist()
+        zeta = np.array(of_phi)
         self._samples += 1
         share = 1.0 / min(self._samples, MEMORY)
         v_square, u_square, mean_size = self._means
