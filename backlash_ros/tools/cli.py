@@ -57,15 +57,16 @@ OPTIONS: dict[str, dict[str, Any]] = {
 }
 
 
-def add_options(parser: argparse.ArgumentParser, *names: str) -> None:
+def add_options(parser: argparse.ArgumentParser, *names: str) -> argparse.ArgumentParser:
     for name in names:
         parser.add_argument(name, **OPTIONS[name])
+    return parser
 
 
-def span_of(parser: argparse.ArgumentParser, options: argparse.Namespace) -> Span:
-    """The part of a run between --from and --to; ends the process where there is none."""
+def span_of(options: argparse.Namespace) -> Span:
+    """The part of a run between --from and --to; raises InputError where there is none."""
     if not options.from_s < options.to_s:
-        parser.error(f'--from {options.from_s:g} must be < --to {options.to_s:g}')
+        raise InputError(f'--from {options.from_s:g} must be < --to {options.to_s:g}')
     return Span(options.from_s, options.to_s)
 
 

@@ -112,9 +112,8 @@ def _measure(
 
 
 def make_parser() -> argparse.ArgumentParser:
-    parser = OptionParser('compare', description=__doc__)
-    cli.add_options(parser, '--config', '--set', '--axis', '--seed', '--out', '--duration')
-    return parser
+    return cli.add_options(OptionParser('compare', description=__doc__), '--config', '--set',
+                           '--axis', '--seed', '--out', '--duration')
 
 
 def _compare(args: Sequence[str] | None) -> None:

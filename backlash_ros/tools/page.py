@@ -21,10 +21,7 @@ def page(
     title: str, lead: str, warnings: Sequence[str], parts: Sequence[str],
     pictures: Sequence[Picture], folded: tuple[str, str] | None = None,
 ) -> str:
-    """A page as text; lead and parts are HTML.
-
-    folded: heading and text of a last section that opens on a click.
-    """
+    """A page as text; lead and parts are HTML; folded: heading and text of a last section."""
     sections = list(parts)
     for _, name, caption, data in pictures:
         heading, coded = escape(name), base64.b64encode(data).decode('ascii')
@@ -36,20 +33,12 @@ def page(
     template = Template(Path(__file__).with_suffix('.html').read_text(encoding='utf-8'))
     return template.substitute(title=escape(title), lead=lead, content='\n'.join([
         *(f'<p class="warning">{escape(warning)}</p>' for warning in warnings),
-        *(f'<section>\n{section}\n</section>' for section in sections),
-    ]))
+        *(f'<section>\n{section}\n</section>' for section in sections)]))
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    head = ''.join(f'<th>{cell}</th>' for cell in header)
-    return f'<table><thead><tr>{head}</tr></thead><tbody>{_body(rows)}</tbody></table>'
-
-
-def facts(pairs: Sequence[tuple[str, str]], columns: int = 2) -> str:
-    """A table of names and values, so many pairs in a row; the cells are HTML."""
-    rows = [sum(pairs[i:i + columns], ()) for i in range(0, len(pairs), columns)]
-    return f'<table class="facts">{_body(rows)}</table>'
-
-
-def _body(rows: Sequence[Sequence[str]]) -> str:
-    return ''.join(f'<tr>{"".join(f"<td>{cell}</td>" for cell in row)}</tr>' for row in rows)
+    """A table of cells that are HTML; without a header its rows are names and values."""
+    lines = [''.join(f'<th>{cell}</th>' for cell in header),
+             *(''.join(f'<td>{cell}</td>' for cell in row) for row in rows)]
+    kind = 'values' if header else 'facts'
+    return f'<table class="{kind}">{"".join(f"<tr>{line}</tr>" for line in lines if line)}</table>'

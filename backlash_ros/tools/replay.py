@@ -42,15 +42,13 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('runs', type=Path, nargs='+', metavar='RUN',
                         help='a bag, a folder of results, or a log, as identify reads it, with '
                              '--config; several give a table')
-    cli.add_options(parser, '--config', '--set', '--columns', '--sweep', '--axis', '--from', '--to',
-                    '--out')
-    return parser
+    return cli.add_options(parser, '--config', '--set', '--columns', '--sweep', '--axis', '--from',
+                           '--to', '--out')
 
 
 def _replay(args: Sequence[str] | None) -> None:
-    parser = make_parser()
-    options = parser.parse_args(args)
-    span, changes = cli.span_of(parser, options), combinations(options.sweep)
+    options = make_parser().parse_args(args)
+    span, changes = cli.span_of(options), combinations(options.sweep)
     sources = [_opened(path, options, span) for path in options.runs]
     if len(sources) * len(changes) == 1:
         _one(sources[0], options.out)

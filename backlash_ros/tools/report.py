@@ -18,7 +18,7 @@ from backlash_ros.tools import cli, figures
 from backlash_ros.tools.cli import NOTHING, number
 from backlash_ros.tools.config import config_text
 from backlash_ros.tools.figures import png
-from backlash_ros.tools.page import Picture, facts, page, table
+from backlash_ros.tools.page import Picture, page, table
 from backlash_ros.tools.records.reading import read_run_or_log
 from backlash_ros.tools.runs import files
 from backlash_ros.tools.runs import summary as told
@@ -128,7 +128,7 @@ def _tables(summary: Mapping[str, Any]) -> str:
     duration = (summary['samples'] + summary['lost_samples']) * summary['sample_period']
     first = summary['began_with']
     began = ', '.join(f'{name} {number(first[name], 6)}' for name in BACKLASH)
-    return table(('', *told.ESTIMATE_HEADER, 'unit'), rows) + facts([
+    return table(('', *told.ESTIMATE_HEADER, 'unit'), rows) + table((), [
         ('samples', f'{summary["samples"]} in {duration:.6g} s'),
         ('lost samples', str(summary['lost_samples'])),
         ('sample period', f'{summary["sample_period"]:.6g} s'),
@@ -153,14 +153,12 @@ def make_parser() -> argparse.ArgumentParser:
     parser = OptionParser('report', description=__doc__)
     parser.add_argument('path', type=Path, help='a bag or its .mcap file, a folder of results, '
                         'samples.csv, or a log as identify reads it')
-    cli.add_options(parser, '--config', '--columns', '--axis', '--from', '--to', '--out')
-    return parser
+    return cli.add_options(parser, '--config', '--columns', '--axis', '--from', '--to', '--out')
 
 
 def _report(args: Sequence[str] | None) -> None:
-    parser = make_parser()
-    options = parser.parse_args(args)
-    run, _ = read_run_or_log(options.path.resolve(), options.config, cli.span_of(parser, options),
+    options = make_parser().parse_args(args)
+    run, _ = read_run_or_log(options.path.resolve(), options.config, cli.span_of(options),
                              options.axis, options.columns)
     out = files.result_directory(options.out)
     write_report(run, out)

@@ -86,7 +86,7 @@ def _identify(args: Sequence[str] | None) -> bool:
         parser.error('give a RECORD, or --drive')
     if ros_arguments and not options.drive:
         parser.error('--ros-args are for --drive')
-    span = span_of(parser, options)
+    span = span_of(options)
     given: Mapping[str, Value] = {}
     # numpy, scipy and matplotlib are loaded once the options are known to be right.
     if options.config is not None:

@@ -21,7 +21,7 @@ from backlash_ros.core.parameters import BRINGUP, BY_NAME, PLANT, ParameterError
 from backlash_ros.core.records.record import Record
 from backlash_ros.tools.cli import BrokenOffError, format_table
 from backlash_ros.tools.config import ANY, config_text
-from backlash_ros.tools.page import facts, page, table
+from backlash_ros.tools.page import page, table
 from backlash_ros.tools.records.columns import COMMAND, ROLES
 from backlash_ros.tools.runs.files import result_directory, write_summary, write_table
 
@@ -79,7 +79,7 @@ def write_outcome(
         'Identification of backlash and G(z)',
         f'<b>The backlash is {"" if known else "not "}known</b>: {len(found.y)} samples of '
         f'{found.sample_period:g} s from {escape(record.source)}.', [*lines, *refused, *notes],
-        [table(head, constants) + facts([(name, escape(fact)) for name, fact in told], 1)]
+        [table(head, constants) + table((), [(name, escape(fact)) for name, fact in told])]
         if constants else [], drawn, None if text is None else (YAML, text)))
     print('\n'.join([
         *lines, *([format_table(head, constants)] if constants else []),
