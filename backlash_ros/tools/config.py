@@ -166,15 +166,13 @@ def _read_sections(path: Path) -> list[Section]:
         reason = error.strerror if isinstance(error, OSError) else ' '.join(str(error).split())
         raise InputError(f'{path}: cannot be read: {reason}') from None
     try:
-        if not isinstance(document, dict) or not document:
-            raise InputError('must hold "/**: {ros__parameters: {...}}"')
         sections = {}
-        for name, content in document.items():
-            if not isinstance(content, dict) or set(content) != {'ros__parameters'}:
-                raise InputError('each section must hold ros__parameters and nothing else')
-            if not isinstance(content['ros__parameters'], dict):
-                raise InputError('ros__parameters must hold "name: value" lines')
-            sections[str(name)] = dict(flattened(content['ros__parameters']))
+        for name, content in document.items() if isinstance(document, dict) else ():
+            if isinstance(content, dict) and [*content] == ['ros__parameters'] \
+                    and isinstance(content['ros__parameters'], dict):
+                sections[str(name)] = dict(flattened(content['ros__parameters']))
+        if not sections or len(sections) < len(document):
+            raise InputError('must hold sections "NAME: {ros__parameters: {name: value, ...}}"')
         # What is wrong with the values of a joint, all values together tell.
         joints = [joint for values in sections.values()
                   for joint in Parameters({'joints': values.get('joints', ())}).joints]
