@@ -27,7 +27,6 @@ COMPARISON_HEADER = (
     'loop', 'control error', 'tracking error', 'backlash penalty', 'total variation of v',
     'crossings per reversal',
 )
-COMPARISON_WINDOW_S = 0.5  # over which the error of a curve is averaged
 # No gap is wider than this one by definition (2.1), which is as good as none.
 GAPLESS = {'backlash.c_r': 1e-9, 'backlash.c_l': -1e-9}
 
@@ -94,10 +93,10 @@ def _measure(
     except cli.BrokenOffError as broken:
         return Result(name, note=str(broken))
     t, since = run.column('t'), 0.2 * run.samples * run.sample_period
-    window = max(round(COMPARISON_WINDOW_S / run.sample_period), 1)
     error = penalty = tracking = None
     if follows:
-        tracking = moving_rms(run.column('y') - run_record.delayed_reference(run, delay), window)
+        tracking = moving_rms(
+            run.column('y') - run_record.delayed_reference(run, delay), run.sample_period)
         gapless = run_loop(build_closed_loop(p.replaced({
             **GAPLESS, **_fixed(p.backlash.m, 0.0, 0.0), 'fixed.doubt': 0.0,
         })), samples)
@@ -108,7 +107,7 @@ def _measure(
         run_record.control_error_rms(run), error, penalty,
         run_record.total_variation(run.column('v')[t >= since]),
         run_record.gap_crossings_per_reversal(run, since),
-    ), ErrorCurves(name, t, moving_rms(control_error(run), window), tracking))
+    ), ErrorCurves(name, t, moving_rms(control_error(run), run.sample_period), tracking))
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -128,7 +127,7 @@ def _compare(args: Sequence[str] | None) -> None:
     figure, document = 'images/comparison.png', out / 'comparison.md'
     (out / figure).parent.mkdir(parents=True, exist_ok=True)
     curves = [result.curves for result in results if result.curves is not None]
-    write_atomically(out / figure, png(draw_error_curves(curves, COMPARISON_WINDOW_S)))
+    write_atomically(out / figure, png(draw_error_curves(curves)))
     template = Template(Path(__file__).with_name('comparison.md').read_text(encoding='utf-8'))
     numbers = {'frequency': scenario.frequency, 'noise': scenario.output_noise_std,
                **scenario.backlash._asdict()}

@@ -16,7 +16,7 @@ from backlash_ros.core.estimate import Status
 from backlash_ros.core.plant.backlash import Backlash
 from backlash_ros.core.simulation.run_record import SETTLING_TOLERANCE, RunRecord
 from backlash_ros.tools.cli import number
-from backlash_ros.tools.runs.summary import ErrorCurves, Part
+from backlash_ros.tools.runs.summary import ERROR_WINDOW_S, ErrorCurves, Part
 from backlash_ros.topics import BACKLASH
 
 Array = NDArray[np.float64]
@@ -235,12 +235,12 @@ def draw_input(run: RunRecord, parts: Sequence[Part]) -> Figure:
     return figure
 
 
-def draw_error_curves(loops: Sequence[ErrorCurves], window_s: float) -> Figure:
-    """RMS over window_s of the control errors (Figure 5 of the paper) and any tracking errors."""
+def draw_error_curves(loops: Sequence[ErrorCurves]) -> Figure:
+    """Moving RMS of the control errors (Figure 5 of the paper) and of any tracking errors."""
     colours = [HUES[name] for name in ('m', 'c_r', 'c_l', 'v', 'u_d', 'y', 'y_m', 'u')]
     rows: dict[str, list[Line]] = {
-        f'RMS of $u - u_d$ over {window_s:.3g} s\n[unit of u]': [],
-        f'RMS of $y - y_m$ over {window_s:.3g} s\n[unit of y]': [],
+        f'RMS of $u - u_d$ over {ERROR_WINDOW_S} s\n[unit of u]': [],
+        f'RMS of $y - y_m$ over {ERROR_WINDOW_S} s\n[unit of y]': [],
     }
     for i, (name, t, *errors) in enumerate(loops):
         # The curve of the loop without backlash comes to lie on that of the one that has learned.

@@ -65,10 +65,9 @@ def _figures(
             'loop with level stretches, as wide as the gap, where v turns.',
             png(figures.draw_log(run)))
         return
-    start, end = parts = told.interesting_parts(run, parameters)
+    start, end = parts = told.interesting_parts(run)
     truth, error, innovation = run.has_truth, told.control_error(run), run.column('innovation')
-    curves, window_s, notes = told.compare_laws(run, parameters) if truth and parameters else \
-        ([], 0.0, [])
+    curves, notes = told.compare_laws(run, parameters) if truth and parameters else ([], [])
     known = np.isfinite(error).any()
     duration = min(float(run.column('t')[-1]) + run.sample_period, 1e4 * run.sample_period)
     y_m, delay, followed = told.followed_reference(run, parameters)
@@ -88,7 +87,7 @@ def _figures(
         (curves, 'laws', 'Control error of the laws (Figure 5 of the paper)',
          'This run beside the other laws, simulated with the same parameters, over the first '
          f'{duration:.6g} s.' + ''.join(f' Without a curve: {escape(note)}.' for note in notes),
-         lambda _: figures.draw_error_curves(curves, window_s)),
+         lambda _: figures.draw_error_curves(curves)),
         (True, 'hysteresis', 'Backlash: the v–u loop',
          'u follows the right line going up, the left line going down, and is held between them. '
          'Where a dashed line lies on the wide one, the estimate is right.' if truth else

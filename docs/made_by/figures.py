@@ -87,12 +87,12 @@ def draw_figure_4() -> Figure:
 
 def draw_figure_5() -> Figure:
     run = simulate(5.0)
-    return drawn.draw_error_curves(*compare_laws(run.record, run.parameters)[:2])
+    return drawn.draw_error_curves(compare_laws(run.record, run.parameters)[0])
 
 
 def draw_loop() -> Figure:
     run = simulate(5.0)
-    return drawn.draw_hysteresis(run.record, interesting_parts(run.record, run.parameters)[1])
+    return drawn.draw_hysteresis(run.record, interesting_parts(run.record)[1])
 
 
 def draw_uncertain_plant() -> Figure:

@@ -1,7 +1,7 @@
 """What is told of a run: its figures of merit, the content of summary.json, and its curves."""
 
 from collections.abc import Mapping
-from math import isfinite, pi
+from math import isfinite
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from backlash_ros.core.assembly import LAWS, build_structure, first_guess, law_fits
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.parameters import ParameterError, Parameters
-from backlash_ros.core.reference.signal import PERIODIC
 from backlash_ros.core.simulation import run_record
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
@@ -20,6 +19,7 @@ from backlash_ros.topics import BACKLASH
 
 Array = NDArray[np.float64]
 
+ERROR_WINDOW_S = 0.5  # over which the error of a curve is averaged
 ESTIMATE_HEADER = ('estimate', 'std', 'truth', 'error', 'within 1 % from')
 
 
@@ -114,44 +114,33 @@ def control_error(run: RunRecord) -> Array:
     return run.column('u') - run.column('u_d')
 
 
-def _reference_period(parameters: Parameters | None) -> float | None:
-    periodic = parameters is not None and parameters.waveform in PERIODIC
-    return 2.0 * pi / parameters.frequency if parameters and periodic else None
-
-
-def interesting_parts(run: RunRecord, parameters: Parameters | None) -> tuple[Part, Part]:
-    """Start and end of a run: two periods of y_m each, or a tenth of the run."""
-    period = _reference_period(parameters)
-    samples = round(2.0 * period / run.sample_period) if period else run.samples // 10
-    samples = min(max(samples, 2), run.samples)
+def interesting_parts(run: RunRecord) -> tuple[Part, Part]:
+    """Start and end of a run, a tenth of it each."""
+    samples = min(max(run.samples // 10, 2), run.samples)
     return Part('Start', slice(0, samples)), Part('End', slice(run.samples - samples, None))
 
 
-def moving_rms(values: Array, samples: int) -> Array:
-    """RMS of the newest `samples` values at each place, fewer at the start; nan is left out."""
+def moving_rms(values: Array, sample_period: float) -> Array:
+    """RMS over the last ERROR_WINDOW_S at each place, fewer at the start; nan is left out."""
     known = np.isfinite(values)
     # Each sum from scratch: a running one would keep the rounding errors of large values long past.
-    window = np.ones(samples)
+    window = np.ones(max(round(ERROR_WINDOW_S / sample_period), 1))
     with np.errstate(over='ignore'):  # of a law that diverges
         squares = np.convolve(np.where(known, values, 0.0) ** 2, window)[:len(values)]
     count = np.convolve(known.astype(np.float64), window)[:len(values)]
     return np.where(count > 0.0, np.sqrt(squares / np.maximum(count, 1.0)), np.nan)
 
 
-def compare_laws(
-    run: RunRecord, parameters: Parameters,
-) -> tuple[list[ErrorCurves], float, list[str]]:
+def compare_laws(run: RunRecord, parameters: Parameters) -> tuple[list[ErrorCurves], list[str]]:
     """The run's law beside every other one, simulated with the same parameters (Figure 5).
 
-    Also over how long the RMS is taken [s], and what kept a law from its curve.
+    Also what kept a law from its curve.
     """
     t, own, notes = run.column('t'), parameters.estimator.law, []
     samples = min(round(float(t[-1]) / run.sample_period) + 1, 10_000)
-    window_s = _reference_period(parameters) or 1.0
-    window = max(round(window_s / run.sample_period), 1)
     compared = t < (samples - 0.5) * run.sample_period
     curves = [ErrorCurves(f'{own} (this run)', t[compared],
-                          moving_rms(control_error(run)[compared], window))]
+                          moving_rms(control_error(run)[compared], run.sample_period))]
     for law in (law for law in LAWS if law != own and law_fits(law, parameters.structure)):
         try:
             other = run_loop(build_closed_loop(parameters.replaced({
@@ -159,8 +148,9 @@ def compare_laws(
         except (ParameterError, InputError, BrokenOffError) as error:
             notes.append(f'{law}: {error}')
             continue
-        curves.append(ErrorCurves(law, other.column('t'), moving_rms(control_error(other), window)))
-    return curves, window_s, notes
+        curves.append(ErrorCurves(
+            law, other.column('t'), moving_rms(control_error(other), run.sample_period)))
+    return curves, notes
 
 
 def followed_reference(run: RunRecord, parameters: Parameters | None) -> tuple[Array, float, bool]:

@@ -187,16 +187,16 @@ def test_moving_rms_is_that_of_the_newest_samples() -> None:
     values = np.array([3.0, nan, 4.0, 1e-9, 0.0, 1e-9])
     small = 1e-9 / np.sqrt(2)
     expected = [3.0, 3.0, 4.0, np.sqrt(8.0), small, small]
-    np.testing.assert_allclose(moving_rms(values, 2), expected, rtol=1e-9)
+    np.testing.assert_allclose(moving_rms(values, 0.25), expected, rtol=1e-9)
 
 
 def test_law_that_breaks_off_does_not_take_the_report_with_it(run: RunRecord) -> None:
     other = PARAMETERS.replaced({'waveform': 'file', 'file': 'gone.csv'})
-    curves, _, notes = compare_laws(run, other)
+    curves, notes = compare_laws(run, other)
     assert [len(curve.t) for curve in curves] == [run.samples]
     assert notes
     assert all('gone.csv' in note for note in notes)
-    assert isinstance(figures.draw_error_curves(curves, 0.5), Figure)
+    assert isinstance(figures.draw_error_curves(curves), Figure)
 
 
 @pytest.mark.parametrize('storage', StoragePlugin)
