@@ -64,10 +64,8 @@ def contenders(scenario: Parameters) -> dict[str, dict[str, object]]:
 
 
 def _fixed(m: float, c_r: float, c_l: float) -> dict[str, object]:
-    return {
-        'estimator.law': 'fixed', 'estimator.initial.m': m, 'estimator.initial.c_r': c_r,
-        'estimator.initial.c_l': c_l, 'estimates.load': False,
-    }
+    return {'estimator.law': 'fixed', 'estimator.initial.m': m, 'estimator.initial.c_r': c_r,
+            'estimator.initial.c_l': c_l, 'estimates.load': False}
 
 
 def compare(scenario: Parameters, samples: int) -> list[Result]:

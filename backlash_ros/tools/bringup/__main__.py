@@ -15,11 +15,9 @@ exit codes: 0 done, 2 bad input, 1 anything else (a process died, nothing moves,
 A first Ctrl-C (SIGTERM, SIGHUP) stops all processes in order and reports what was recorded, a
 second one kills them at once. It is the regular end of a run with --duration inf.
 
-environment: unless you set them yourself,
-  ROS_AUTOMATIC_DISCOVERY_RANGE  is LOCALHOST: nothing leaves this machine
-  ROS_DOMAIN_ID                  is one that nobody uses on this machine, or 0 with --driver none;
-                                 it is printed, so that you can listen in
-  ROS_LOG_DIR                    is DIR/logs/ros
+environment: unless you set them yourself, ROS_AUTOMATIC_DISCOVERY_RANGE is LOCALHOST, ROS_LOG_DIR
+is DIR/logs/ros, and ROS_DOMAIN_ID is one that nobody uses on this machine (0 with --driver none),
+which is printed, so that you can listen in.
 """
 
 import argparse

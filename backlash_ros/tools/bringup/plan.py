@@ -99,8 +99,7 @@ def _checked(p: Parameters, axis: str, options: argparse.Namespace) -> Parameter
     driver = (p.driver if options.driver is None else options.driver).strip()
     p = p.replaced({
         'lockstep': options.lockstep or p.lockstep, 'driver': driver.replace('{axis}', axis),
-        'samples': 0 if options.duration == inf else number_of_samples(p, options.duration),
-    })
+        'samples': 0 if options.duration == inf else number_of_samples(p, options.duration)})
     try:
         shlex.split(driver)
     except ValueError as error:
@@ -123,8 +122,7 @@ def _checked(p: Parameters, axis: str, options: argparse.Namespace) -> Parameter
             raise ParameterError(
                 f'{joint}.{missing[0]}' if joint else missing[0], own[missing[0]],
                 'is no limit, and a driver moves an actuator',
-                f'set {", ".join(missing)}, or give --unlimited',
-            )
+                f'set {", ".join(missing)}, or give --unlimited')
         build_controller(own)
     build_reference(p)
     if not driver:

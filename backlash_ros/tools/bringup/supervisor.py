@@ -34,8 +34,7 @@ def child_environment(log_folder: Path, domain: int | None) -> dict[str, str]:
     environment = {
         'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', 'ROS_LOG_DIR': str(log_folder / 'ros'),
         **ONE_THREAD, **with_source(os.environ), 'BACKLASH_ROS_EVENTS': '1',
-        'PYTHONUNBUFFERED': '1', **({'ROS_DOMAIN_ID': str(domain)} if domain is not None else {}),
-    }
+        'PYTHONUNBUFFERED': '1', **({'ROS_DOMAIN_ID': str(domain)} if domain is not None else {})}
     prefer_loopback(environment)  # for drivers; the nodes of this package do so themselves
     return environment
 

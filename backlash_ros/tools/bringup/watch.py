@@ -56,13 +56,10 @@ class AxisProgress:
     def unheard(self) -> dict[str, int]:
         return Counter(self.published or {}) - Counter(self.heard)
 
-    def begin(self) -> None:
-        self.began = self.moved = time.monotonic()
-
     def take(self, progress: Mapping[str, Any]) -> None:
         sample, p = progress['sample'], self.plan.parameters
         if self.made == 0:
-            self.begin()
+            self.began = time.monotonic()
             # A driver may have been running before; a simulated plant begins with sample 0.
             self.first = sample if p.driver else 0
         made = sample + 1 - self.first
@@ -114,7 +111,7 @@ class RunWatch:
             self._wait_until_ready()
             for axis in axes:
                 if axis.made == 0:
-                    axis.begin()
+                    axis.began = axis.moved = time.monotonic()
             while not (self._over or all(axis.complete for axis in axes)):
                 self._listen()
                 for axis in axes:
@@ -158,8 +155,7 @@ class RunWatch:
                 raise BrokenOffError('\n'.join([
                     f'not ready within {START_DEADLINE_S:g} s: '
                     f'{", ".join(child.name for child in late)}{hint}',
-                    *(f'the end of {child.end_of_log()}' for child in late),
-                ]))
+                    *(f'the end of {child.end_of_log()}' for child in late)]))
             self._listen()
 
     def _listen(self) -> None:

@@ -206,8 +206,7 @@ def _of_axis(
         # Nodes that were renamed are known by their labels.
         names = sorted(
             name for name, given in labels_of.items() if topic_ends_like(name, topic)
-            or (name.rpartition('/')[2] == topic.rpartition('/')[2] and set(labels) <= set(given))
-        )
+            or (name.rpartition('/')[2] == topic.rpartition('/')[2] and set(labels) <= set(given)))
         if topic == topics.SIGNALS and names:
             joints = list(dict.fromkeys(
                 label.partition('.')[0] for label in labels_of[names[0]] if '.' in label))
