@@ -50,9 +50,8 @@ def write_report(run: files.Run, out: Path) -> dict[str, Any]:
     for picture in pictures:
         write_atomically(out / picture.name, picture.data)
     write_atomically(out / REPORT_PAGE, page(
-        'Adaptive backlash inverse control', headline(summary),
-        [f'{note[0].upper()}{note[1:]}.' for note in notes], [_tables(summary)], pictures, folded,
-    ))
+        'Adaptive backlash inverse control', headline(summary), [f'{note}.' for note in notes],
+        [_tables(summary)], pictures, folded))
     return summary
 
 
@@ -60,10 +59,8 @@ def _figures(
     run: RunRecord, parameters: Parameters | None, summary: Mapping[str, Any],
 ) -> Iterator[Picture]:
     if not np.isfinite(run.column('m')).any():
-        yield Picture(
-            'log.png', 'v and y', 'What the log holds, as it was read. With play, y over v is a '
-            'loop with level stretches, as wide as the gap, where v turns.',
-            png(figures.draw_log(run)))
+        yield Picture('log.png', 'v and y', 'What the log holds. With play, y over v is a loop '
+                      'with level stretches where v turns.', png(figures.draw_log(run)))
         return
     start, end = parts = told.interesting_parts(run)
     truth, error, innovation = run.has_truth, told.control_error(run), run.column('innovation')
@@ -106,9 +103,7 @@ def _figures(
 
 def headline(summary: Mapping[str, Any]) -> str:
     if summary['final']['m'] is None or not np.isfinite(summary['final']['m']):
-        return 'A log of v and y, which no controller has estimated anything from: ' \
-               '<code>identify</code> tells its backlash, <code>replay</code> what a controller ' \
-               'would have learned.'
+        return 'A log of v and y, which no controller has estimated anything from: try identify.'
     times, who = summary['settling_time_s'], f'The law <b>{summary["estimator"] or "–"}</b>'
     if summary['truth']['m'] is None:
         return f'{who} estimated the backlash; no truth was recorded to compare with.'
