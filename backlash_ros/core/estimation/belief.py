@@ -1,4 +1,4 @@
-"""What is believed of the backlash, what is published of it, and what older samples leave of it."""
+"""What is believed of the backlash, and what older samples leave of it."""
 
 from dataclasses import replace
 from enum import Enum, auto
@@ -11,7 +11,7 @@ from backlash_ros.core.estimate import Status
 from backlash_ros.core.estimation import settings
 from backlash_ros.core.estimation.explanations import Setup
 from backlash_ros.core.estimation.fit import Problem, Window
-from backlash_ros.core.estimation.posterior import Prior, WindowFit, agree
+from backlash_ros.core.estimation.posterior import Prior, WindowFit
 from backlash_ros.core.plant.backlash import Region, engaged, reversals
 from backlash_ros.core.plant.transfer_function import Array
 
@@ -74,50 +74,6 @@ class Belief(NamedTuple):
     def trusted(self) -> bool:
         """Whether the fit explains its samples and is known well enough."""
         return self.state is State.KNOWN and self.reason is not Status.INCONSISTENT
-
-
-def published(setup: Setup, belief: Belief, fit: WindowFit) -> Belief:
-    """This belief with that fit, and what is published of it."""
-    belief, known = belief._replace(fit=fit), belief.inherited
-    if known is not None:
-        return _beside_inherited(setup, belief, fit, known)
-    if not setup.is_known(fit, settings.REVERSALS):
-        return belief._replace(reason=Status.INCONSISTENT)
-    if belief.trial.predicted < belief.trial.must:
-        return belief
-    cov = fit.crossings_cov + np.diag(setup.drift**2 * (belief.end - belief.kept.first) / 3.0)
-    cov[1:, 1:] += (fit.walk_std / fit.m) ** 2 * (belief.next_at - belief.end)
-    known = Known(fit.crossings, cov)
-    return belief._replace(published=known, reason=Status.TRACKING, coasts=False)
-
-
-def _beside_inherited(setup: Setup, belief: Belief, fit: WindowFit, known: Known) -> Belief:
-    # What samples leave unexplained may be gap too, and a gear's lost motion differs by motion.
-    replacing = 0.05  # std of the gap over the gap, from which samples alone replace what was known
-    doubt = (fit.unexplained * fit.gap) ** 2 / 2.0
-    cov = fit.crossings_cov + doubt * np.diag([0.0, 1.0, 1.0])
-    gap = known.crossings[1] - known.crossings[2]
-    of_motion = (settings.LOST_MOTION * gap) ** 2 / 2.0
-    prior = known.cov + 1e-18 * np.diag(known.crossings**2 + gap**2)
-    as_told = agree(fit.crossings, known.crossings, cov + prior)
-    if not as_told:
-        prior = prior + np.diag([(0.01 * known.crossings[0]) ** 2, of_motion, of_motion])
-    if not agree(fit.crossings, known.crossings, cov + prior):
-        std = sqrt(fit.gap_std**2 + 2.0 * doubt)
-        # A gear that is no play leaves systematic residuals, and denies nothing.
-        white = not fit.systematic and not setup.noisier(fit)
-        sure = std < replacing * fit.gap and white and fit.left.turns >= settings.HELD_REVERSALS
-        if sure and belief.trial.predicted >= belief.trial.must:
-            belief = belief._replace(inherited=None)  # it was that of another plant
-        return belief._replace(reason=Status.INCONSISTENT)
-    gain = prior @ np.linalg.pinv(cov + prior)
-    joined = Known(known.crossings + gain @ (fit.crossings - known.crossings), prior - gain @ prior)
-    if belief.coasts or (not as_told and fit.systematic):
-        joined = known  # what explains y no better is no reason to move
-    if not setup.are_precise(*joined, fit.systematic):
-        return belief._replace(reason=Status.ACQUIRING)
-    reason = Status.INCONSISTENT if setup.moves_unexplained(fit) else Status.TRACKING
-    return belief._replace(published=joined, reason=reason)
 
 
 def shortened(

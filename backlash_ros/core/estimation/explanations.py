@@ -15,8 +15,8 @@ from backlash_ros.core.estimation import settings
 from backlash_ros.core.estimation.fit import FEW_STEPS, FIRST_STEPS, Problem, Window
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.posterior import Prior, WindowFit
-from backlash_ros.core.estimation.score_tests import with_walk
 from backlash_ros.core.estimation.search import search
+from backlash_ros.core.estimation.unmodelled import with_walk
 from backlash_ros.core.law import OutOfBounds
 from backlash_ros.core.plant.transfer_function import Array
 

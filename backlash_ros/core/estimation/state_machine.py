@@ -12,18 +12,18 @@
 |           |                            |                      | long as a search looks          |
 """
 
-from math import isnan
+from math import isnan, sqrt
 
 import numpy as np
 
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.estimation import settings
-from backlash_ros.core.estimation.belief import Belief, State, Trial, published, shortened
+from backlash_ros.core.estimation.belief import Belief, Known, State, Trial, shortened
 from backlash_ros.core.estimation.explanations import Setup, afresh, mixed, outliers
 from backlash_ros.core.estimation.fit import FEW_STEPS, Problem, Window
-from backlash_ros.core.estimation.posterior import Prior, WindowFit
-from backlash_ros.core.estimation.score_tests import coasts, likelier, with_walk
+from backlash_ros.core.estimation.posterior import Prior, WindowFit, agree
 from backlash_ros.core.estimation.settings import BLOCKS, FEWEST, MISFIT, PREDICTED, SHORT_RECORD
+from backlash_ros.core.estimation.unmodelled import coasts, likelier, with_walk
 
 
 def learn(setup: Setup, record: Window, before: Belief) -> Belief:
@@ -127,7 +127,7 @@ def _adopted(
     another_noise = before.published is None or fit.walk_std > 0.0
     if before.fit is not None and another_noise and fit.alike(before.fit):
         must = min(must, PREDICTED)  # another noise, or a walk, but not another backlash
-    return published(setup, before._replace(
+    return _published(setup, before._replace(
         found=None, doubt_from=None, coasts=coasts(setup.problem(record, older), fit),
         kept=before.kept._replace(first=record.first, older=older),
         trial=Trial(must, 0, fit.noise),
@@ -186,7 +186,7 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
     else:
         fit = problem.finished(fit)
     after = after._replace(coasts=coasts(problem, fit))
-    return published(setup, *shortened(setup, record, problem, after, fit))
+    return _published(setup, *shortened(setup, record, problem, after, fit))
 
 
 def _contradicts(
@@ -256,3 +256,47 @@ def _doubted(setup: Setup, record: Window, before: Belief) -> Belief:
     if newer > max(short, 2 * count // max(held.left.turns, 1)):
         return _begun_anew(after, since, record.end, record.end + 1)
     return after
+
+
+def _published(setup: Setup, belief: Belief, fit: WindowFit) -> Belief:
+    """This belief with that fit, and what is published of it."""
+    belief, known = belief._replace(fit=fit), belief.inherited
+    if known is not None:
+        return _beside_inherited(setup, belief, fit, known)
+    if not setup.is_known(fit, settings.REVERSALS):
+        return belief._replace(reason=Status.INCONSISTENT)
+    if belief.trial.predicted < belief.trial.must:
+        return belief
+    cov = fit.crossings_cov + np.diag(setup.drift**2 * (belief.end - belief.kept.first) / 3.0)
+    cov[1:, 1:] += (fit.walk_std / fit.m) ** 2 * (belief.next_at - belief.end)
+    known = Known(fit.crossings, cov)
+    return belief._replace(published=known, reason=Status.TRACKING, coasts=False)
+
+
+def _beside_inherited(setup: Setup, belief: Belief, fit: WindowFit, known: Known) -> Belief:
+    # What samples leave unexplained may be gap too, and a gear's lost motion differs by motion.
+    replacing = 0.05  # std of the gap over the gap, from which samples alone replace what was known
+    doubt = (fit.unexplained * fit.gap) ** 2 / 2.0
+    cov = fit.crossings_cov + doubt * np.diag([0.0, 1.0, 1.0])
+    gap = known.crossings[1] - known.crossings[2]
+    of_motion = (settings.LOST_MOTION * gap) ** 2 / 2.0
+    prior = known.cov + 1e-18 * np.diag(known.crossings**2 + gap**2)
+    as_told = agree(fit.crossings, known.crossings, cov + prior)
+    if not as_told:
+        prior = prior + np.diag([(0.01 * known.crossings[0]) ** 2, of_motion, of_motion])
+    if not agree(fit.crossings, known.crossings, cov + prior):
+        std = sqrt(fit.gap_std**2 + 2.0 * doubt)
+        # A gear that is no play leaves systematic residuals, and denies nothing.
+        white = not fit.systematic and not setup.noisier(fit)
+        sure = std < replacing * fit.gap and white and fit.left.turns >= settings.HELD_REVERSALS
+        if sure and belief.trial.predicted >= belief.trial.must:
+            belief = belief._replace(inherited=None)  # it was that of another plant
+        return belief._replace(reason=Status.INCONSISTENT)
+    gain = prior @ np.linalg.pinv(cov + prior)
+    joined = Known(known.crossings + gain @ (fit.crossings - known.crossings), prior - gain @ prior)
+    if belief.coasts or (not as_told and fit.systematic):
+        joined = known  # what explains y no better is no reason to move
+    if not setup.are_precise(*joined, fit.systematic):
+        return belief._replace(reason=Status.ACQUIRING)
+    reason = Status.INCONSISTENT if setup.moves_unexplained(fit) else Status.TRACKING
+    return belief._replace(published=joined, reason=reason)

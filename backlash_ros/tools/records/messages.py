@@ -11,8 +11,8 @@ from backlash_ros import topics
 from backlash_ros.core.loop.command_history import REPORTED, without_origin
 from backlash_ros.core.loop.diagnosis import TROUBLE
 from backlash_ros.core.records.record import Record, RecordError
-from backlash_ros.core.records.rows_to_record import Rows, on_grid, usable, without_turns
 from backlash_ros.core.records.stamps import in_order
+from backlash_ros.core.records.time_grid import Rows, on_grid, usable, without_turns
 from backlash_ros.tools.runs.read_run import choose_namespace, read_topics, topic_ends_like
 
 Messages = Sequence[tuple[int, float]]  # stamps [ns] and values

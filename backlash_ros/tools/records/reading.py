@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from backlash_ros.core.records.record import Record, RecordError
-from backlash_ros.core.records.rows_to_record import record_of
+from backlash_ros.core.records.time_grid import record_of
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 from backlash_ros.tools.cli import WHOLE_SPAN, InputError, Span
 from backlash_ros.tools.config import effective_parameters

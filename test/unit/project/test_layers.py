@@ -24,7 +24,7 @@ ROOMS = (
     'identification', 'driver_check',
 )
 ESTIMATION = (
-    'settings', 'plant_family', 'posterior', 'fit', 'score_tests', 'search', 'explanations',
+    'settings', 'plant_family', 'posterior', 'fit', 'unmodelled', 'search', 'explanations',
     'belief', 'state_machine', 'observer', 'estimator',
 )
 NUMERIC = {'numpy', 'scipy'}

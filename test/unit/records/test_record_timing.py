@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.records import readings
 from backlash_ros.core.records.record import Record, RecordError
-from backlash_ros.core.records.rows_to_record import averaged, record_of
 from backlash_ros.core.records.stamps import spread_evenly
+from backlash_ros.core.records.time_grid import averaged, record_of
 
 Array = NDArray[np.float64]
 PERIOD_S = 0.01
