@@ -5,21 +5,17 @@ import os
 import sys
 from math import inf
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 DONE, FAILED, BAD_INPUT = 0, 1, 2  # exit codes
 DEFAULT_CONFIG = 'paper_example.yaml'
 
 
 class OptionParser(argparse.ArgumentParser):
-    """Ends the process with one line, and `hint` behind it, where an option is wrong."""
-
-    def __init__(self, prog: str, hint: str = ' (--help lists the options)', **others: Any) -> None:
-        super().__init__(prog, **others)
-        self._hint = hint
+    """Ends the process with one line where an option is wrong."""
 
     def error(self, message: str) -> NoReturn:
-        self.exit(BAD_INPUT, f'{self.prog}: {message}{self._hint}\n')
+        self.exit(BAD_INPUT, f'{self.prog}: {message} (--help lists the options)\n')
 
 
 def positive(text: str) -> float:

@@ -6,7 +6,6 @@ A section /AXIS/NODE holds values of one node of one axis; ** stands for all axe
 
 import difflib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -41,8 +40,7 @@ class Setting(NamedTuple):
     value: Value
 
 
-@dataclass(frozen=True)
-class Configuration:
+class Configuration(NamedTuple):
     """A file with what the command line changes in it; axes of controllers, joints of one."""
 
     path: Path

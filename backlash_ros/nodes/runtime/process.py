@@ -135,8 +135,8 @@ def run(
         try:
             _initialise(arguments)
             OptionParser(
-                executable, ': parameters are given as --ros-args -p NAME:=VALUE or --params-file '
-                'FILE', usage=f'{executable} [--ros-args -p NAME:=VALUE --params-file FILE ...]',
+                executable,
+                usage=f'{executable} [--ros-args -p NAME:=VALUE --params-file FILE ...]',
                 description=sys.modules[make_node.__module__].__doc__,
                 formatter_class=argparse.RawDescriptionHelpFormatter,
                 epilog='parameters, with their defaults (* may change in a running node):'

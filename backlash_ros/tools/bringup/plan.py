@@ -4,7 +4,6 @@ import argparse
 import shlex
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from math import inf
 from pathlib import Path
 from typing import NamedTuple
@@ -20,8 +19,7 @@ from backlash_ros.tools.runs.files import BAG, CONFIG_FILE, result_directory
 ELSEWHERE = 'none'  # the parameter driver where somebody else starts it
 
 
-@dataclass(frozen=True)
-class AxisPlan:
+class AxisPlan(NamedTuple):
     """One controller of a run, its parameters complete and checked; name: also its namespace.
 
     Of the parameters, samples is 0 without end, and driver empty for the simulated plant.

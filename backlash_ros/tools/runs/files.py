@@ -6,11 +6,10 @@ import json
 import zipfile
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from datetime import datetime, timezone
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +24,7 @@ CONFIG_FILE, BAG = 'parameters.yaml', 'bag'
 SAMPLE_COLUMNS = (*COLUMNS[:COLUMNS.index('u_hat')], 'status')
 
 
-@dataclass(frozen=True)
-class Run:
+class Run(NamedTuple):
     """A run that was simulated or recorded; parameters are None where they are unknown.
 
     latency_s: from the departure of y(k) at the driver to that of v(k) at the controller, shape

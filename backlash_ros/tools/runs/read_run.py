@@ -46,7 +46,7 @@ def read_run(
         parameters = configuration.parameters(axis if known else ''.join(configuration.joints[:1]))
     period = parameters.sample_period if parameters else None
     if bag := find_bag(path):
-        return replace(read_bag(bag, period, span, axis), parameters=parameters)
+        return read_bag(bag, period, span, axis)._replace(parameters=parameters)
     inside = (path / RECORD_FILE, path / SAMPLES_FILE)
     file = next(filter(Path.is_file, inside), path)
     if not file.is_file() or file.suffix not in ('.npz', '.csv'):
