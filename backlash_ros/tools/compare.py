@@ -39,10 +39,6 @@ class Result(NamedTuple):
     curves: ErrorCurves | None = None
     note: str = ''
 
-    @property
-    def row(self) -> tuple[str, ...]:
-        return (self.name, *(cli.number(merit, 3) for merit in self.merits))
-
 
 def contenders(scenario: Parameters) -> dict[str, dict[str, object]]:
     """What sets the loops apart, by name, from the paper's to the one without a backlash."""
@@ -119,7 +115,7 @@ def _compare(args: Sequence[str] | None) -> None:
     results = compare(scenario, cli.number_of_samples(scenario, options.duration))
     # Drawing libraries take a second to load, which bad input should not cost.
     from backlash_ros.tools.figures import draw_error_curves, png
-    rows = [result.row for result in results]
+    rows = [(each.name, *(cli.number(merit, 3) for merit in each.merits)) for each in results]
     print(cli.format_table(COMPARISON_HEADER, rows))
     out = result_directory(options.out)
     figure, document = 'images/comparison.png', out / 'comparison.md'

@@ -132,8 +132,7 @@ def _tables(summary: Mapping[str, Any]) -> str:
         ('tracking error RMS, last half',
          number(summary['tracking_error_rms'], 3, '% of y<sub>m</sub>', 100.0)
          + (', which is not its aim' if summary['structure'] == 'proportional' else '')),
-        ('latency y → v, median', number(latency['p50'], 3, 'ms')),
-        ('latency y → v, 99th percentile', number(latency['p99'], 3, 'ms')),
+        *((f'latency y → v, {name}', number(value, 3, 'ms')) for name, value in latency.items()),
         ('state at the end', escape(summary['final_status'] or NOTHING)),
         ('noise on y, learned / nominal', number(summary['noise_ratio'], 3)),
         ('unexplained motion of u',

@@ -195,13 +195,11 @@ def run(plan: RunPlan, requests: StopRequests) -> RunWatch:
     if requests.count:
         raise BrokenOffError(f'interrupted by {requests.last}')
     discovery = os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    awaited = [axis.name for axis in plan.axes if axis.parameters.driver == ELSEWHERE]
     domain = None
     with ExitStack() as stack:
-        if awaited:
+        if any(axis.parameters.driver == ELSEWHERE for axis in plan.axes):
             # Whoever started the driver did so in the domain that is set there, or in none.
-            of = f' of {", ".join(awaited)}' if awaited != [''] else ''
-            print(f'waiting for the driver{of} as long as it takes: start it with ROS_DOMAIN_ID='
+            print('waiting for the driver as long as it takes: start it with ROS_DOMAIN_ID='
                   f'{os.environ.get("ROS_DOMAIN_ID") or 0} '
                   f'ROS_AUTOMATIC_DISCOVERY_RANGE={discovery}')
         elif not os.environ.get('ROS_DOMAIN_ID'):
