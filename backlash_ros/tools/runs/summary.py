@@ -115,8 +115,8 @@ def control_error(run: RunRecord) -> Array:
 
 
 def interesting_parts(run: RunRecord) -> tuple[Part, Part]:
-    """Start and end of a run, a tenth of it each."""
-    samples = min(max(run.samples // 10, 2), run.samples)
+    """Start and end of a run, a tenth of it each, but 2 s at least."""
+    samples = min(max(run.samples // 10, round(2.0 / run.sample_period), 2), run.samples)
     return Part('Start', slice(0, samples)), Part('End', slice(run.samples - samples, None))
 
 
