@@ -22,7 +22,6 @@ UNDRAWN = Path(__file__).with_name('undrawn.py')
 
 
 def marked_processes(mark: str) -> dict[int, str]:
-    """Command lines of all processes whose environment holds the mark, by process id."""
     found = {}
     for process in psutil.process_iter():
         with suppress(psutil.Error):  # gone meanwhile, or of another user
@@ -53,12 +52,10 @@ class Session:
         return self.process.wait(DEADLINE_S)
 
     def wait_for_samples(self, axis: str = '') -> None:
-        """Return once the progress tells of samples, of the axis if its title is given."""
         wait_until(
             lambda: self.process.poll() is not None or any(
                 ' lost ' in line and line.startswith(axis) for line in self.stderr.splitlines()
-            ), 'progress',
-        )
+            ), 'progress')
         assert self.process.poll() is None, self.stderr
 
     def survivors(self) -> dict[int, str]:
@@ -68,8 +65,7 @@ class Session:
         module = f'backlash_ros.nodes.{name} '
         (pid,) = (
             pid for pid, command in self.survivors().items()
-            if module in command and namespace in command.split(' -r ')[-1]
-        )
+            if module in command and namespace in command.split(' -r ')[-1])
         return pid
 
 
@@ -80,10 +76,7 @@ def bringup_sessions(folder: Path) -> Iterator[Callable[..., Session]]:
     Reports have no pictures, which take longer than most runs.
     """
     sessions: list[Session] = []
-
-    def start_session(
-        *arguments: str, variables: Mapping[str, str] | None = None,
-    ) -> Session:
+    def start_session(*arguments: str, variables: Mapping[str, str] | None = None) -> Session:
         own = folder / str(len(sessions))
         own.mkdir()
         mark = uuid.uuid4().hex
@@ -99,12 +92,10 @@ def bringup_sessions(folder: Path) -> Iterator[Callable[..., Session]]:
             process = subprocess.Popen(
                 [sys.executable, *program, '--out', str(own / 'results'), *arguments],
                 stdout=out, stderr=err, env=environment,
-                cwd=Path(bringup.__file__).resolve().parents[2],
-            )
+                cwd=Path(bringup.__file__).resolve().parents[2])
         session = Session(process, mark, own / 'results', stdout, stderr)
         sessions.append(session)
         return session
-
     try:
         yield start_session
     finally:

@@ -14,8 +14,7 @@ ADDRESS = re.compile(r'http://127\.0\.0\.1:\d+$', re.MULTILINE)
 
 def address_of(session: Session) -> str:
     wait_until(
-        lambda: ADDRESS.search(session.stdout) or session.process.poll() is not None, 'the address'
-    )
+        lambda: ADDRESS.search(session.stdout) or session.process.poll() is not None, 'the address')
     found = ADDRESS.search(session.stdout)
     assert found, session.stderr
     return found[0]

@@ -62,11 +62,9 @@ def node_with(values: dict[str, object], domain: int) -> Iterator[ControllerNode
 def catch_commands(node: ControllerNode, sent: Callable[[float], None]) -> None:
     io: Any = node._io
     publish = io.publish
-
     def note(commands: Mapping[str, float]) -> None:
         sent(commands[''])
         publish(commands)
-
     io.publish = note
 
 
@@ -120,8 +118,7 @@ class Bench:
             # Times of arrival, which would be of another clock, are left out.
             hand_over(
                 self.node, self._reference(0.01 * self._k),
-                Output(self.plant.measure(), self._now_ns, 0, 0, self._k),
-            )
+                Output(self.plant.measure(), self._now_ns, 0, 0, self._k))
             for loop in self.node.configured:
                 loop.core.refine()  # however long it takes
 
@@ -140,11 +137,9 @@ class Bench:
         return answer.result()
 
     def change(self, *transitions: int) -> bool:
-        """Whether all transitions succeeded."""
         return all(
             self.ask('change_state', ChangeState, ChangeState.Request(transition=Transition(id=t)))
-            .success for t in transitions
-        )
+            .success for t in transitions)
 
     def set_bool(self, service: str, value: bool) -> bool:
         return bool(self.ask(service, SetBool, SetBool.Request(data=value)).success)
@@ -155,8 +150,7 @@ class Bench:
     def set_parameters(self, **values: object) -> Any:
         """What the node says to new values, of which none or all are taken; __ stands for a dot."""
         return self.node.set_parameters_atomically([
-            Parameter(name.replace('__', '.'), value=value) for name, value in values.items()
-        ])
+            Parameter(name.replace('__', '.'), value=value) for name, value in values.items()])
 
 
 @contextmanager

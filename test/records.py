@@ -45,8 +45,7 @@ def swing(count: int, size: float = 3.0, seed: int = 0) -> Array:
     rng = np.random.default_rng(seed)
     t = PERIOD_S * np.arange(count)
     return size / 2.0 * sum(
-        np.sin(2.0 * np.pi * f * t + rng.uniform(0.0, 2.0 * np.pi)) for f in (0.7, 1.9, 3.7)
-    )
+        np.sin(2.0 * np.pi * f * t + rng.uniform(0.0, 2.0 * np.pi)) for f in (0.7, 1.9, 3.7))
 
 
 def output(

@@ -54,8 +54,7 @@ class ForkedNode:
         # Daemons end with the tests.
         self._process: ForkServerProcess = FORKING.Process(
             target=_run_node, daemon=True,
-            args=(executable, list(arguments), stdout, stderr, dict(environment)),
-        )
+            args=(executable, list(arguments), stdout, stderr, dict(environment)))
         # The first start forks nothing yet, but does the imports, one of which reads this.
         with patch.dict(os.environ, BACKLASH_ROS_EVENTS='1'):
             self._process.start()
@@ -113,15 +112,13 @@ class NodeProcess:
         self.executable = executable
         number = len(list(folder.glob('*.stderr')))
         self._stdout, self._stderr = (
-            folder / f'{number}-{executable}.{kind}' for kind in ('stdout', 'stderr')
-        )
+            folder / f'{number}-{executable}.{kind}' for kind in ('stdout', 'stderr'))
         with self._stdout.open('wb') as out, self._stderr.open('wb') as err:
             self.process = ForkedNode(
                 executable, arguments, self._stdout, self._stderr, environment
             ) if forked else subprocess.Popen(
                 [sys.executable, '-m', f'backlash_ros.nodes.{executable}', *arguments],
-                stdin=subprocess.DEVNULL, stdout=out, stderr=err, env=environment,
-            )
+                stdin=subprocess.DEVNULL, stdout=out, stderr=err, env=environment)
 
     @property
     def stderr(self) -> str:
@@ -139,8 +136,7 @@ class NodeProcess:
     def wait_for(self, kind: str) -> dict[str, Any]:
         wait_until(
             lambda: self.events(kind) or self.process.poll() is not None,
-            f'{kind} of {self.executable}',
-        )
+            f'{kind} of {self.executable}')
         events = self.events(kind)
         assert events, f'{self.executable} ended without {kind}:\n{self.stderr}'
         return events[0]
@@ -190,13 +186,11 @@ class Probe:
         it answers is not heard.
         """
         asked: list[Future] = []
-
         def answered() -> bool:
             if not asked or time.monotonic() > self._asked_at + AGAIN_S:
                 asked.append(call())
                 self._asked_at = time.monotonic()
             return any(future.done() for future in asked)
-
         self.wait_until(answered, what)
         return next(future for future in asked if future.done()).result()
 

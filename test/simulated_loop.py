@@ -35,8 +35,7 @@ class SimulatedLoop:
 
     def __init__(self, reports: bool = False, v: float | None = None, **values: object) -> None:
         self.p = Parameters({
-            'output_noise_std': NOISE, 'estimator.output_noise_std': NOISE, **values,
-        })
+            'output_noise_std': NOISE, 'estimator.output_noise_std': NOISE, **values})
         self.rng = np.random.default_rng(7)
         self.sensor = Sensor(self.rng, swing=10.0)
         self.driver = Driver(self.p, self.rng, Actuator(), self.sensor, reports)
@@ -47,8 +46,7 @@ class SimulatedLoop:
         self.rows: list[Estimate] = []  # one for each command that answers an output
         self.controller = Controller(
             self.p, self.driver, None, lambda v, limits: self.sent.append(v),
-            lambda step, renewed: self.rows.append(step.estimate),
-        )
+            lambda step, renewed: self.rows.append(step.estimate))
         if v is not None:
             self.controller.restart(None, v)
 
@@ -62,8 +60,7 @@ class SimulatedLoop:
             before = driver.actuator.v
             driver.advance()
             driver.outputs = [
-                each for output in driver.outputs for each in self.fault(driver.tick, output)
-            ]
+                each for output in driver.outputs for each in self.fault(driver.tick, output)]
             y_m = driver.reference(driver.tick * self.p.sample_period)
             self.controller.run(y_m if self.referred else None)
             if self.deaf():

@@ -41,8 +41,7 @@ def plays(draw: st.DrawFn) -> Play:
 @st.composite
 def usual_plays(draw: st.DrawFn) -> Play:
     return Play(
-        draw(st.floats(0.1, 10.0)), draw(st.floats(0.05, 20.0)), draw(st.floats(-20.0, -0.05))
-    )
+        draw(st.floats(0.1, 10.0)), draw(st.floats(0.05, 20.0)), draw(st.floats(-20.0, -0.05)))
 
 
 def signals(size: float = 100.0, min_size: int = 1, max_size: int = 60) -> st.SearchStrategy:
@@ -66,8 +65,7 @@ def plants(draw: st.DrawFn, integrating: bool | None = None) -> TransferFunction
     poles: list[complex] = [1.0] if integrating else []
     poles += _roots(draw, order - len(poles), st.floats(0.05, 0.95))
     zeros = _roots(
-        draw, draw(st.integers(0, order - 1)), st.one_of(st.floats(0.0, 0.6), st.floats(2.0, 5.0))
-    )
+        draw, draw(st.integers(0, order - 1)), st.one_of(st.floats(0.0, 0.6), st.floats(2.0, 5.0)))
     gain = draw(st.floats(0.01, 100.0))
     # Unit gain at z = 1 (per sample, for an integrator) keeps y of the size of u.
     numerator = np.real(np.poly(zeros)) if zeros else np.ones(1)

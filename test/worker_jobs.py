@@ -10,7 +10,6 @@ from backlash_ros.core.jobs import ChannelSamples
 
 
 def checksum(samples: ChannelSamples, factor: float) -> tuple[int, int, float]:
-    """Which samples there are, and a number that depends on all of them and their order."""
     first, columns = samples
     weights = np.arange(1.0, columns.shape[1] + 1.0)
     return first, columns.shape[1], factor * float((columns @ weights).sum())

@@ -30,22 +30,19 @@ def parameters(**changes: object) -> dict[str, object]:
         'sample_period': PERIOD_S, 'plant.numerator': numerator,
         'plant.denominator': denominator, 'estimator.output_noise_std': 1e-3,
         'control.min': -REACH, 'control.max': REACH, 'control.rate_max': RATE,
-        **{name.replace('__', '.'): value for name, value in changes.items()},
-    }
+        **{name.replace('__', '.'): value for name, value in changes.items()}}
 
 
 def plant_parameters() -> Parameters:
     return Parameters(parameters(
-        backlash__m=1.3, backlash__c_r=1.0, backlash__c_l=-0.8, output_noise_std=5e-4,
-    ))
+        backlash__m=1.3, backlash__c_r=1.0, backlash__c_l=-0.8, output_noise_std=5e-4))
 
 
 def messages(values: list[float], offset: float, age_s: float = 1e-4) -> list[Message]:
     stamps = [START_NS + int((k + offset) * PERIOD_S * 1e9) for k in range(len(values))]
     return [
         Message(value, stamp, stamp + int(age_s * 1e9), k + 1)
-        for k, (value, stamp) in enumerate(zip(values, stamps, strict=True))
-    ]
+        for k, (value, stamp) in enumerate(zip(values, stamps, strict=True))]
 
 
 def heard_from_driver(

@@ -37,8 +37,7 @@ class PacedDriver:
 
     def __init__(self, probe: Probe, reports_applied: bool = False) -> None:
         p = Parameters({
-            'output_noise_std': NOISE, 'sample_period': PERIOD_S, 'frequency': 0.06 / PERIOD_S,
-        })
+            'output_noise_std': NOISE, 'sample_period': PERIOD_S, 'frequency': 0.06 / PERIOD_S})
         self.probe = probe
         self.plant, self._signal = build_plant(p), build_reference(p)
         self.sent: Sent = as_measured
@@ -64,10 +63,8 @@ class PacedDriver:
                 and self.reference.get_subscription_count() > 0
                 and node.count_publishers(topics.ESTIMATES) > 0
                 and node.count_publishers(topics.CONTROL) > 0
-                and (self.applied is None or self.applied.get_subscription_count() > 0)
-            ),
-            'the controller',
-        )
+                and (self.applied is None or self.applied.get_subscription_count() > 0)),
+            'the controller')
         self.rest()
 
     def run(self, samples: int) -> None:
@@ -96,8 +93,7 @@ class PacedDriver:
         """Whether the newest diagnostics hold these words, be it as one finding of several."""
         status = self.status()
         return status is not None and any(
-            words in text for text in (status.message, *(pair.value for pair in status.values))
-        )
+            words in text for text in (status.message, *(pair.value for pair in status.values)))
 
     def text(self, key: str) -> str:
         status = self.status()

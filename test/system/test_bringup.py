@@ -84,8 +84,7 @@ def test_a_run_in_lockstep_equals_the_simulation_to_the_last_bit_and_leaves_no_p
     settings = [f'{name}={value}' for name, value in {**values, 'storage': storage}.items()]
     session = start(
         '--lockstep', '--duration', str(0.01 * samples), '--seed', '5',
-        *(part for each in settings for part in ('--set', each)),
-    )
+        *(part for each in settings for part in ('--set', each)))
     assert session.wait() == 0, session.stderr
     assert session.survivors() == {}
     simulated = build_closed_loop(effective_parameters(None, settings, 5)).run(samples)
@@ -103,11 +102,9 @@ def test_a_run_in_lockstep_equals_the_simulation_to_the_last_bit_and_leaves_no_p
     assert counts[topics.TRUTH] == counts[topics.APPLIED_CONTROL] == samples
     summary = json.loads((session.out / 'summary.json').read_text())
     assert (summary['samples'], summary['lost_samples']) == (
-        simulated.samples, samples - simulated.samples
-    )
+        simulated.samples, samples - simulated.samples)
     assert {path.stem for path in (session.out / 'logs').glob('*.log')} >= {
-        'controller', 'plant', 'recorder', 'reference',
-    }
+        'controller', 'plant', 'recorder', 'reference'}
     effective = yaml.safe_load((session.out / 'parameters.yaml').read_text())
     parameters = effective['/**']['ros__parameters']
     assert (parameters['seed'], parameters['lockstep'], parameters['samples']) == (5, True, samples)
@@ -124,8 +121,7 @@ def test_a_run_in_lockstep_equals_the_simulation_to_the_last_bit_and_leaves_no_p
 def test_a_killed_controller_is_named_and_stops_every_axis_and_its_driver(start):
     session = start(
         '--config', str(TWO_AXES), '--unlimited', '--driver', OF_AN_AXIS, '--duration', '100',
-        '--set', 'bias=0.5', '--set', 'tilt/bias=0.25', '--set', CHEAP,
-    )
+        '--set', 'bias=0.5', '--set', 'tilt/bias=0.25', '--set', CHEAP)
     session.wait_for_samples('pan: ')
     session.wait_for_samples('tilt: ')
     os.kill(session.node('controller', '/tilt'), signal.SIGKILL)
@@ -155,13 +151,11 @@ def test_nothing_survives_a_killed_bringup_and_its_bag_is_whole(start):
 
 def test_a_driver_that_dies_is_named_with_its_last_words_and_the_run_is_reported(start, tmp_path):
     session = start(
-        '--unlimited', '--driver', foreign_driver(tmp_path), '--duration', '100', '--set', CHEAP
-    )
+        '--unlimited', '--driver', foreign_driver(tmp_path), '--duration', '100', '--set', CHEAP)
     session.wait_for_samples()
     (driver,) = (
         pid for pid, command in session.survivors().items()
-        if 'driver.py' in command and '--driver' not in command
-    )
+        if 'driver.py' in command and '--driver' not in command)
     os.kill(driver, signal.SIGUSR1)
     assert (session.wait(), session.survivors()) == (1, {})
     assert 'driver died (exit code 1)' in session.stderr
@@ -173,8 +167,7 @@ def test_a_driver_that_dies_is_named_with_its_last_words_and_the_run_is_reported
 def test_the_last_command_of_the_controller_reaches_the_driver(start, tmp_path):
     session = start(
         '--unlimited', '--driver', foreign_driver(tmp_path), '--duration', 'inf', '--no-record',
-        '--set', 'on_stop=zero', '--set', 'bias=20', '--set', CHEAP,
-    )
+        '--set', 'on_stop=zero', '--set', 'bias=20', '--set', CHEAP)
     session.wait_for_samples()
     session.process.send_signal(signal.SIGINT)
     assert session.wait() == 0, session.stderr
@@ -191,12 +184,10 @@ def test_a_driver_elsewhere_is_awaited_and_ctrl_c_is_the_regular_end_of_an_endle
     with ros_world(folder) as world:
         session = start(
             '--unlimited', '--driver', 'none', '--duration', 'inf', '--set', CHEAP,
-            variables={'ROS_DOMAIN_ID': str(world.domain)},
-        )
+            variables={'ROS_DOMAIN_ID': str(world.domain)})
         wait_until(
             lambda: 'waiting for the driver' in session.stdout
-            or session.process.poll() is not None, 'a word on the terminal',
-        )
+            or session.process.poll() is not None, 'a word on the terminal')
         assert f'ROS_DOMAIN_ID={world.domain} ' in session.stdout, session.stderr
         plant = world.start('plant')
         session.wait_for_samples()
@@ -256,8 +247,7 @@ def test_joints_of_an_arm_have_one_controller_and_a_report_each(start, tmp_path)
     session = start(
         '--config', str(tmp_path / 'arm.yaml'), '--duration', '2', '--set',
         'elbow/estimator.initial.c_r=0.05',
-        '--driver', shlex.join([sys.executable, str(tmp_path / 'arm.py')]),
-    )
+        '--driver', shlex.join([sys.executable, str(tmp_path / 'arm.py')]))
     assert session.wait() == 0, session.stderr
     assert session.survivors() == {}
     assert 'waiting for whoever plans the motion, on robot_joint_command' in session.stdout

@@ -64,8 +64,7 @@ class World:
             [sys.executable, str(ROOT / 'examples' / 'bus_servo_driver.py'), '--port',
              str(self.link), '--rate', str(RATE), '--speed', str(SPEED), '--patience', '300',
              '--joints', *ids],
-            env=self.world.environment, stderr=self.log.open('wb'), stdin=subprocess.DEVNULL,
-        )
+            env=self.world.environment, stderr=self.log.open('wb'), stdin=subprocess.DEVNULL)
         stack.callback(self.driver.wait)
         stack.callback(self.driver.kill)
         self.probe.wait_until(
@@ -82,8 +81,7 @@ class World:
         return (
             list(self.applied[-1].position) == pytest.approx(positions, abs=RESOLUTION)
             and list(self.heard[-1].name) == NAMES
-            and list(self.heard[-1].position) == pytest.approx(positions, abs=lost)
-        )
+            and list(self.heard[-1].position) == pytest.approx(positions, abs=lost))
 
     def stop(self) -> str:
         self.driver.terminate()
@@ -94,21 +92,17 @@ class World:
 def test_joints_follow_through_silence_and_a_pulled_plug_and_are_limp_at_the_end(tmp_path):
     with ExitStack() as stack:
         arm = World(tmp_path, stack)
-
         def await_log(words: str) -> None:
             arm.probe.wait_until(lambda: words in arm.log.read_text(), words)
-
         goals = [0.3, -0.2, 0.25, 0.5, -0.4, 0.35]
         arm.probe.wait_until(lambda: arm.told(goals), 'the arm')
         # Names in another order, one that is nobody's, one without a position; the others stay.
         message = JointState(name=['elbow', 'nobody', 'waist', 'shoulder'],
                              position=[0.1, 1.0, -0.1, math.nan])
         expected = [-0.1, -0.2, 0.1, 0.5, -0.4, 0.35]
-
         def went() -> bool:
             arm.by_name.publish(message)
             return list(arm.applied[-1].position) == pytest.approx(expected, abs=RESOLUTION)
-
         arm.probe.wait_until(went, 'the named joints')
         arm.bus.dead.add(2)
         others = [name for name in NAMES if name != 'shoulder']
@@ -129,10 +123,8 @@ def test_joints_follow_through_silence_and_a_pulled_plug_and_are_limp_at_the_end
         assert found
         print(found[0])
         cycles, lost = map(int, found.groups())
-
         def complete() -> int:
             return sum(len(message.name) == len(NAMES) for message in arm.heard)
-
         arm.probe.wait_until(lambda: complete() >= cycles - lost - 5, 'what was not lost')
     assert arm.bus.largest <= MOST
     assert 0 < lost < cycles

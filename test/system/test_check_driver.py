@@ -24,7 +24,6 @@ BEHIND_THE_DRIVER = {'backlash.m': 1.3, 'backlash.c_r': 1.0, 'backlash.c_l': -0.
 
 @pytest.fixture
 def world(tmp_path: Path) -> Iterator[RosWorld]:
-    """A domain, and the parameters that the driver's user would write into a file."""
     # JSON is YAML.
     (tmp_path / 'driver.yaml').write_text(json.dumps({'/**': {'ros__parameters': parameters()}}))
     with ros_world(tmp_path) as world:
@@ -55,15 +54,13 @@ def test_what_is_wrong_in_the_graph_is_seen_and_nothing_is_judged_of_a_mixture(w
     probe = world.probe()
     best_effort = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
     first, _ = (
-        probe.node.create_publisher(Float64, '/motor/plant_output', best_effort) for _ in range(2)
-    )
+        probe.node.create_publisher(Float64, '/motor/plant_output', best_effort) for _ in range(2))
     waiting = start(world, '--wait', str(DEADLINE_S))
     wait_until(lambda: ' '.join(REMAP) in waiting.stdout, 'a hint')
     waiting.kill()
     process = start(world, '--duration', '1', *REMAP)
     probe.wait_until(
-        lambda: first.publish(Float64(data=1.0)) or process.process.poll() is not None, 'the end'
-    )
+        lambda: first.publish(Float64(data=1.0)) or process.process.poll() is not None, 'the end')
     assert process.wait() == 1
     assert {'publisher', 'QoS'} <= subjects(process.stdout, '✗')
     assert {'rate', 'values', 'backlash'} <= subjects(process.stdout, '–')

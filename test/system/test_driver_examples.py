@@ -32,8 +32,7 @@ def runnable(words: list[str]) -> list[str]:
     program, *arguments = words
     name = program.removeprefix('.venv/bin/')
     modules = dict(
-        re.findall(r"f'(\w+) = \{PACKAGE\}\.([\w.]+):main'", (ROOT / 'setup.py').read_text())
-    )
+        re.findall(r"f'(\w+) = \{PACKAGE\}\.([\w.]+):main'", (ROOT / 'setup.py').read_text()))
     if name in SHORT_S and '--duration' in arguments:
         arguments[arguments.index('--duration') + 1] = SHORT_S[name]
     arguments += NARROW.get(name, [])
@@ -94,8 +93,7 @@ def run_or_start(
     if any(mark in text for mark in FOREVER) and '--driver' not in words:
         started.append(subprocess.Popen(
             runnable(words), cwd=folder, env=environment, stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-        ))
+            stdout=subprocess.DEVNULL))
         return
     if '--driver' in words:
         for process in started:
@@ -104,8 +102,7 @@ def run_or_start(
         started.clear()
     done = subprocess.run(
         runnable(words), cwd=folder, env=environment, capture_output=True, text=True,
-        timeout=DEADLINE_S,
-    )
+        timeout=DEADLINE_S)
     assert does_what_it_is_for(done), done.stdout + done.stderr
 
 

@@ -45,8 +45,7 @@ class Arm:
         array = changes.get('io.command') == 'array'
         self.commands = self.probe.collect(
             topics.JOINT_COMMANDS if array else topics.JOINT_STATE_COMMANDS,
-            Float64MultiArray if array else JointState,
-        )
+            Float64MultiArray if array else JointState)
         self.diagnostics = self.probe.collect(topics.DIAGNOSTICS, DiagnosticArray)
         self.signals = self.probe.collect(topics.SIGNALS, Float64MultiArray)
         self._states = self.probe.publisher(topics.ROBOT_STATES, JointState)
@@ -54,14 +53,12 @@ class Arm:
         self.probe.wait_until(
             lambda: self.controller.events('ready') and self._states.get_subscription_count()
             and self._references.get_subscription_count()
-            and self.probe.node.count_publishers(topics.SIGNALS), 'the controller',
-        )
+            and self.probe.node.count_publishers(topics.SIGNALS), 'the controller')
         self.k = 0
 
     def refer(self, y_m: Mapping[str, float], velocity: float = 0.5) -> None:
         self._references.publish(JointState(
-            name=list(y_m), position=list(y_m.values()), velocity=[velocity] * len(y_m)
-        ))
+            name=list(y_m), position=list(y_m.values()), velocity=[velocity] * len(y_m)))
         self.probe.spin(0.02)
 
     def send(self, y: Mapping[str, float]) -> None:
@@ -69,8 +66,7 @@ class Arm:
         self.k += 1
         self._states.publish(JointState(
             header=Header(stamp=Time(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)),
-            name=list(y), position=list(y.values()),
-        ))
+            name=list(y), position=list(y.values())))
 
     def answer(self, y: Mapping[str, float]) -> JointState | Float64MultiArray:
         before = len(self.commands)
@@ -83,12 +79,10 @@ class Arm:
         return round((1000.0 + k * PERIOD) * 1e9)
 
     def says(self, joint: str, words: str) -> Callable[[], bool]:
-        """Whether a joint has said these words in /diagnostics."""
         return lambda: any(
             status.name == f'controller: {joint}' and words in text
             for message in self.diagnostics for status in message.status
-            for text in (status.message, *(pair.value for pair in status.values))
-        )
+            for text in (status.message, *(pair.value for pair in status.values)))
 
 
 @contextmanager
@@ -115,14 +109,12 @@ def test_every_joint_is_answered_by_its_own_loop_in_one_message(tmp_path: Path) 
             answers.append(it.answer(output(k)))
         for answer in answers:
             assert (list(answer.name), list(answer.velocity)) == (JOINTS, [0.5] * 3)
-        # Nobody has described the gripper.
         assert answers[-1].position[2] == pytest.approx(reference(7)['gripper'], abs=1e-12)
         it.probe.wait_until(lambda: len(it.signals) >= 8, 'signals')
         labels = [dimension.label for dimension in it.signals[-1].layout.dim]
         row = dict(zip(labels, it.signals[-1].data, strict=True))
         assert row['elbow.v'] == answers[-1].position[1]
         assert row['waist.y'] == output(7)['waist']
-        # By name, whatever the order and whoever else is there.
         it.refer({'elbow': 0.2, 'nobody': 7.0, 'waist': 0.1, 'gripper': nan})
         first = it.answer({'stranger': 9.0, 'gripper': 0.0, 'elbow': 0.0, 'waist': 0.0})
         assert list(first.name) == JOINTS
@@ -130,8 +122,7 @@ def test_every_joint_is_answered_by_its_own_loop_in_one_message(tmp_path: Path) 
             answer = it.answer({'elbow': 0.0, 'waist': 0.0})
             assert list(answer.name) == ['waist', 'elbow']
         it.probe.wait_until(
-            it.says('gripper', "no position of joint 'gripper' but elbow, waist"), 'who is missing'
-        )
+            it.says('gripper', "no position of joint 'gripper' but elbow, waist"), 'who is missing')
         assert list(it.answer({'gripper': 0.0, 'elbow': 0.0, 'waist': 0.0}).name) == JOINTS
         for joint in JOINTS:
             it.probe.wait_until(it.says(joint, ''), f'diagnostics of {joint}')
@@ -159,20 +150,17 @@ def test_outputs_reports_and_commands_of_the_joint_pass_and_no_others(tmp_path: 
         control = probe.publisher(topics.CONTROL, Float64)
         node = subprocess.Popen(
             [sys.executable, str(ROOT / 'examples' / 'one_joint.py'), 'elbow'],
-            env=world.environment, stdin=subprocess.DEVNULL,
-        )
+            env=world.environment, stdin=subprocess.DEVNULL)
         try:
             probe.wait_until(lambda: all(
                 each.get_subscription_count() for each in (states, reports, control)
             ) and probe.node.count_publishers(topics.PLANT_OUTPUT), 'the node')
-
             def passed() -> bool:
                 reports.publish(JointState(name=['waist', 'elbow'], position=[1.0, 0.25]))
                 states.publish(JointState(name=['waist'], position=[2.0]))
                 states.publish(JointState(name=['elbow', 'waist'], position=[0.5, 3.0]))
                 control.publish(Float64(data=0.75))
                 return bool(y and applied and commands)
-
             probe.wait_until(passed, 'all three')
         finally:
             node.terminate()
@@ -206,8 +194,7 @@ class StandIn:
             lambda: self._states.get_subscription_count() > 0
             and self.driver.reference.get_subscription_count() > 0
             and self.driver.probe.node.count_publishers(topics.JOINT_COMMANDS) > 0,
-            'the controller',
-        )
+            'the controller')
         self.driver.rest()
 
     def _hear(self, command: Float64MultiArray) -> None:
@@ -231,29 +218,25 @@ class StandIn:
 def test_the_loop_through_ros2_control_is_learned_recorded_and_reported(tmp_path: Path) -> None:
     style: dict[str, object] = {
         'io.style': 'ros2_control', 'io.field': 'velocity', 'io.joint': 'axle',
-        'io.best_effort': True, **OF_THE_LOOP,
-    }
+        'io.best_effort': True, **OF_THE_LOOP}
     with ros_world(tmp_path) as world:
         controller = world.start('controller', style)
         recorder = world.start('recorder', {
             'io.style': 'ros2_control', 'io.best_effort': True, 'bag': str(tmp_path / 'bag'),
-            'wait_for_publishers': True,
-        })
+            'wait_for_publishers': True})
         stand_in = StandIn(world, 'velocity', ['other', 'axel'])
         recorder.wait_for('ready')
         stand_in.meet()
         driver = stand_in.driver
         driver.run_until(
             lambda: driver.says("no velocity of joint 'axle' but other, axel"),
-            'a word about the joint',
-        )
+            'a word about the joint')
         assert driver.controls == []
         stand_in.names = ['other', 'axle']
         driver.run_until_known(0.02)
         driver.check_sanity()
         stand_in.second = driver.probe.node.create_publisher(
-            JointState, topics.JOINT_STATES, stand_in.qos
-        )
+            JointState, topics.JOINT_STATES, stand_in.qos)
         driver.run_until(lambda: driver.says('2 publishers of joint_states'), 'a word about them')
         driver.run(50)
         driver.run_until_known(0.02)

@@ -29,8 +29,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
     with bringup_sessions(tmp_path_factory.mktemp('live')) as start_session:
         session = start_session(
             '--config', 'two_axes.yaml', '--duration', 'inf', '--no-record', '--live',
-            '--set', 'estimator.law=lms',
-        )
+            '--set', 'estimator.law=lms')
         address_of(session)
         session.wait_for_samples('pan')
         yield session
@@ -42,7 +41,6 @@ def test_alone_it_waits_for_a_controller_and_ends_with_ctrl_c(tmp_path: Path) ->
         del world.environment['BACKLASH_ROS_EVENTS']
         live = world.start(MODULE, None, '/pan')
         wait_until(lambda: live.stdout.endswith('\n'), 'the address')
-
         state = next(frames(live.stdout.strip()))['state']
         assert f'of /pan in ROS_DOMAIN_ID={world.domain}' in state['awaited']
         port = live.stdout.strip().rpartition(':')[2]
@@ -104,7 +102,6 @@ class Tab:
         self.errors: list[str] = []
 
     async def call(self, method: str, **parameters: object) -> dict[str, Any]:
-        """The result of a method of the protocol."""
         self._calls += 1
         await self._socket.send_json({'id': self._calls, 'method': method, 'params': parameters})
         while True:
@@ -115,7 +112,6 @@ class Tab:
                 return dict(answer['result'])
 
     async def value(self, expression: str) -> Any:
-        """The value of an expression of JavaScript on the page."""
         answer = await self.call('Runtime.evaluate', expression=expression, returnByValue=True)
         return answer['result'].get('value')
 
@@ -129,8 +125,7 @@ async def tab_of(address: str, profile: Path) -> AsyncIterator[Tab]:
     """The page in a Chromium with a profile of its own."""
     process = subprocess.Popen(
         [str(CHROMIUM), *OPTIONS, f'--user-data-dir={profile}', 'about:blank'],
-        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-    )
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         file = profile / 'DevToolsActivePort'
         while not (file.exists() and '\n' in file.read_text()):
@@ -156,18 +151,15 @@ async def look(session: Session, profile: Path) -> None:
         await tab.wait_until("Number(document.getElementById('samples').textContent) > 0")
         await tab.value(
             "before = document.getElementById('samples').textContent; pictures = "
-            f"{MOVING}.map((id) => document.getElementById(id).toDataURL()); 0"
-        )
+            f"{MOVING}.map((id) => document.getElementById(id).toDataURL()); 0")
         await tab.wait_until("document.getElementById('samples').textContent !== before")
         for i, picture in enumerate(MOVING):
             await tab.wait_until(
-                f"document.getElementById('{picture}').toDataURL() !== pictures[{i}]"
-            )
+                f"document.getElementById('{picture}').toDataURL() !== pictures[{i}]")
         await tab.wait_until(
             "slope = document.getElementById('slope'); empty = document.createElement('canvas'); "
             "[empty.width, empty.height] = [slope.width, slope.height]; "
-            "slope.toDataURL() !== empty.toDataURL()"
-        )
+            "slope.toDataURL() !== empty.toDataURL()")
         await tab.wait_until("document.getElementById('c_r_half').textContent.startsWith('± ')")
         m = await tab.value("document.getElementById('m').textContent")
         assert float(m) == pytest.approx(0.098, rel=0.1)

@@ -23,8 +23,7 @@ class Client:
 
     def change(self, **values: Any) -> Any:
         parameters = [
-            Parameter(name.replace('__', '.'), value=value) for name, value in values.items()
-        ]
+            Parameter(name.replace('__', '.'), value=value) for name, value in values.items()]
         return self._probe.ask(
             lambda: self._client.set_parameters_atomically(parameters), 'an answer'
         ).result
@@ -72,8 +71,7 @@ def dumped(probe: Probe, node: str) -> dict[str, Any]:
 def parameter_file(path: Path, node: str, values: dict[str, Any]) -> str:
     path.write_text(yaml.dump({f'/{node}': {'ros__parameters': {
         name: value.tolist() if isinstance(value, array) else value
-        for name, value in values.items()
-    }}}))
+        for name, value in values.items()}}}))
     return str(path)
 
 
@@ -82,8 +80,7 @@ def test_what_was_dumped_is_complete_and_loads_without_a_change(tmp_path: Path) 
         started = {
             'controller': {'control.max': 5.0, 'estimator.output_noise_std': 1e-6},
             'plant': {'backlash.m': 0.9, 'seed': 4}, 'reference': {'amplitude': 3.0},
-            'recorder': {},
-        }
+            'recorder': {}}
         probe = world.probe()
         for name, parameters in started.items():
             node = world.start(name, {'wait_for_subscribers': 1, **parameters} if name in (

@@ -90,8 +90,7 @@ def test_controllers_are_shown_and_the_selected_one_obeys_the_keys(tmp_path: Pat
         controller, driver = controller_and_driver(world, **{'estimates.file': str(saved)})
         driver.learn()
         driver.run_until(
-            lambda: 'tracking' in screen.frame() and '±' in screen.frame(), 'the screen'
-        )
+            lambda: 'tracking' in screen.frame() and '±' in screen.frame(), 'the screen')
         for piece in ('/controller', 'excitation', 'latency', 'lost', 'learning', 'q quit'):
             assert piece in screen.frame(), piece
         assert re.search(r'm +1\.[23]\d* ± ', screen.frame())
@@ -111,13 +110,11 @@ def test_controllers_are_shown_and_the_selected_one_obeys_the_keys(tmp_path: Pat
         assert driver.error() < 0.1
         screen.press('r')
         driver.run_until(
-            lambda: isnan(driver.estimates[-1].data[4]) and driver.error() > 0.1, 'the reset'
-        )
+            lambda: isnan(driver.estimates[-1].data[4]) and driver.error() > 0.1, 'the reset')
         pan = world.start('controller', None, '--ros-args', '-r', '__ns:=/pan')
         driver.run_until(
             lambda: all(name in screen.frame() for name in ('> /controller', ' /pan/controller')),
-            'both',
-        )
+            'both')
         screen.press('\t')
         driver.run_until(lambda: '> /pan/controller' in screen.frame(), 'the other one')
         driver.run_until(lambda: 'no diagnostics yet' not in screen.frame(), 'its diagnostics')
@@ -152,8 +149,7 @@ def test_it_waits_until_ctrl_c_and_prints_plain_lines_without_a_terminal(tmp_pat
         driver.learn()
         line = re.compile(
             r'^/controller: tracking; m 1\.\d+ ± \S+, c_r \S+ ± \S+, c_l -\S+ ± \S+; '
-            r'excitation \S+, latency \S+ ms, lost \d+$', re.MULTILINE,
-        )
+            r'excitation \S+, latency \S+ ms, lost \d+$', re.MULTILINE)
         driver.run_until(lambda: line.search(monitor.stdout), 'the line')
         assert '\x1b' not in monitor.stdout
         assert (monitor.stop(), monitor.stderr) == (0, '')

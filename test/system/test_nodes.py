@@ -55,13 +55,11 @@ def test_bad_input_ends_a_node_with_one_line_and_exit_code_2(tmp_path: Path) -> 
         ('plant', ['--params-file', str(tmp_path / 'unreadable.yaml')],
          'write all numbers of a list with a decimal point'),
         ('reference', ['-p', 'amplitude'], "'-p amplitude'"),
-        ('recorder', ['-p', f"bag:='{tmp_path / 'bag'}'"], 'exists already: name a new folder'),
-    ]
+        ('recorder', ['-p', f"bag:='{tmp_path / 'bag'}'"], 'exists already: name a new folder')]
     with ros_world(tmp_path) as world:
         nodes = [
             world.start(executable, None, '--ros-args', *arguments)
-            for executable, arguments, _ in cases
-        ]
+            for executable, arguments, _ in cases]
         nodes.append(world.start('reference', None, '--amplitude', '3'))
         answers = [(node.wait(), node.stderr) for node in nodes]
     complaints = [complaint for *_, complaint in cases] + ['unrecognized arguments: --amplitude 3']
@@ -80,20 +78,16 @@ def test_every_node_says_what_it_is_about_and_ends_of_a_signal_with_code_0(tmp_p
         'sample_period 0.01 s (100 Hz); waits for reference and plant_output',
         'plant': '/arm/control in, /arm/plant_output out',
         'reference': '/reference out: square',
-        'recorder': f'records to {bag} (mcap)',
-    }
+        'recorder': f'records to {bag} (mcap)'}
     arm = ('--ros-args', '-r', '__ns:=/arm')
     with ros_world(tmp_path) as world:
         nodes = {
             'controller': world.start('controller', {'control.max': 12}, *arm),
             'plant': world.start(
-                'plant', {'plant.numerator': [1, 2]}, *arm, '--params-file', str(mine)
-            ),
+                'plant', {'plant.numerator': [1, 2]}, *arm, '--params-file', str(mine)),
             'reference': world.start(
-                'reference', {'waveform': 'square'}, '--ros-args', '--params-file', str(mine)
-            ),
-            'recorder': world.start('recorder', {'bag': f"'{bag}'"}),
-        }
+                'reference', {'waveform': 'square'}, '--ros-args', '--params-file', str(mine)),
+            'recorder': world.start('recorder', {'bag': f"'{bag}'"})}
         for node in nodes.values():
             node.wait_for('ready')
         for i, node in enumerate(nodes.values()):
@@ -132,8 +126,7 @@ def test_signals_at_the_start_and_until_the_very_end_do_no_harm(tmp_path: Path) 
             wait_until(
                 lambda node=reference, number=number: (
                     node.send(number) or node.process.poll() is not None
-                ), 'the end', lambda: None,
-            )
+                ), 'the end', lambda: None)
             assert reference.process.returncode == 0
 
 
@@ -142,8 +135,7 @@ def test_estimates_are_saved_before_a_long_ramp_and_sigterm_ends_it(tmp_path: Pa
     with ros_world(tmp_path) as world:
         controller, driver = controller_and_driver(world, **{
             'estimates.file': str(file), 'estimates.save_period': 0.0, 'on_stop': 'ramp',
-            'control.rate_max': RATE_MAX, 'timeout.ramp': 3600.0,
-        })
+            'control.rate_max': RATE_MAX, 'timeout.ramp': 3600.0})
         driver.learn()
         driver.run_until(lambda: abs(driver.v) > 3.0, 'a v away from 0')
         # So that the ramp is not over before anybody has looked at it.
@@ -164,15 +156,13 @@ def test_estimates_are_saved_before_a_long_ramp_and_sigterm_ends_it(tmp_path: Pa
         assert max(steps) < 0.011 * PERIOD_S
         # They are of no use where the samples are others.
         other = world.start('controller', {
-            'estimates.file': str(file), 'estimates.load': True, 'sample_period': 0.01,
-        })
+            'estimates.file': str(file), 'estimates.load': True, 'sample_period': 0.01})
         assert other.wait() == 2
         assert 'was learned with sample_period=0.03, which is now 0.01' in other.stderr
         assert other.stderr.count('\n') == 1
 
 
 def saved_error(file: Path) -> float:
-    """The largest relative error of the estimates in a file, 1 where there is none."""
     if not file.exists():
         return 1.0
     saved = json.loads(file.read_text())['estimate']
@@ -214,8 +204,7 @@ def test_each_cause_is_one_line_in_the_terminal_and_in_the_diagnostics(tmp_path:
         (Float32, 10, 'plant_output is sent as Float32, Float64 is wanted: change /probe'),
         (Float64, best_effort, 'sent best effort, which does not arrive: set io.best'),
         (Float64, 10, 'nobody says which v acts now'),
-        (None, 10, 'no plant_output for 0.3 s: is the driver running?'),
-    ]
+        (None, 10, 'no plant_output for 0.3 s: is the driver running?')]
     with ros_world(tmp_path) as world:
         controller = world.start('controller', {'timeout.plant_output': 0.3})
         probe = world.probe()
@@ -224,13 +213,11 @@ def test_each_cause_is_one_line_in_the_terminal_and_in_the_diagnostics(tmp_path:
         reference = probe.publisher(topics.REFERENCE, Float64)
         for kind, qos, line in causes:
             output = kind and probe.node.create_publisher(kind, topics.PLANT_OUTPUT, qos)
-
             def told(output: Any = output, kind: Any = kind, line: str = line) -> bool:
                 reference.publish(Float64(data=1.0))
                 if output is not None:
                     output.publish(kind(data=1.0))
                 return line in controller.stderr
-
             probe.wait_until(told, line)
             if output is not None:
                 probe.node.destroy_publisher(output)

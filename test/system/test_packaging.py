@@ -53,8 +53,7 @@ def test_colcon_installs_what_the_tools_look_for_and_it_runs(tmp_path: Path) -> 
     ):
         shipped, own = (
             {path.name: path.is_file() and path.read_bytes()
-             for path in (base / folder).glob(pattern)} for base in (share / 'backlash_ros', ROOT)
-        )
+             for path in (base / folder).glob(pattern)} for base in (share / 'backlash_ros', ROOT))
         assert shipped == own != {}
     beside_modules = {path.name for path in installation.rglob('lib/python*/**/*')
                       if path.suffix in ('.html', '.md', '.mplstyle', '.xml')}
@@ -64,8 +63,7 @@ def test_colcon_installs_what_the_tools_look_for_and_it_runs(tmp_path: Path) -> 
     assert {path.name for path in executables.iterdir() if os.access(path, os.X_OK)} == EXECUTABLES
     script = f'. "{installation.parent}/local_setup.bash" && env -0'
     sourced = dict(
-        line.split('=', 1) for line in output_of('bash', '-c', script).split('\0') if '=' in line
-    )
+        line.split('=', 1) for line in output_of('bash', '-c', script).split('\0') if '=' in line)
     homes = output_of(sys.executable, '-c', HOMES, cwd=tmp_path, env=sourced)
     files = dict(line.split(' ', 1) for line in homes.splitlines())
     assert set(files) == EXECUTABLES
@@ -81,14 +79,11 @@ def test_colcon_installs_what_the_tools_look_for_and_it_runs(tmp_path: Path) -> 
         controller = subprocess.Popen(
             executables / 'controller', cwd=tmp_path, stdout=log, stderr=log,
             env={**sourced, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-                 'ROS_DOMAIN_ID': str(world.domain)},
-        )
-
+                 'ROS_DOMAIN_ID': str(world.domain)})
         def answered() -> bool:
             reference.publish(Float64(data=1.0))
             output.publish(Float64(data=0.0))
             return bool(commands) or controller.poll() is not None
-
         try:
             probe.wait_until(answered, 'an answer')
             controller.send_signal(signal.SIGINT)

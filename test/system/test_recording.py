@@ -27,11 +27,9 @@ SAMPLE = topics.SIGNAL_LABELS.index('sample')
 
 
 def start_loop(world: RosWorld, bag: Path, storage: str) -> dict[str, NodeProcess]:
-    """Start the nodes of a run in real time, none of which begins before the others."""
     own: dict[str, dict[str, object]] = {
         'recorder': {'wait_for_publishers': True, 'bag': f"'{bag}'", 'storage': storage},
-        'plant': {'wait_for_subscribers': 3},
-    }
+        'plant': {'wait_for_subscribers': 3}}
     return {name: world.start(name, own.get(name, {'wait_for_subscribers': 2})) for name in NODES}
 
 
@@ -40,8 +38,7 @@ def recorded_samples(bag: Path) -> set[int]:
         return {
             int(reader.deserialize(raw, connection.msgtype).data[SAMPLE])
             for connection, _, raw in reader.messages()
-            if connection.topic == f'/{topics.SIGNALS}'
-        }
+            if connection.topic == f'/{topics.SIGNALS}'}
 
 
 def count_signals(bag: Path) -> int:
@@ -83,7 +80,6 @@ def test_killed_recorder_loses_nothing_that_it_has_flushed(tmp_path, capsys):
     assert report.main([str(bag), '--out', str(tmp_path / 'out')]) == 0
     assert capsys.readouterr().err.startswith(f'report: warning: {told}\n')
     assert cure in (tmp_path / 'out' / 'report.html').read_text()
-
     done = recorder('--repair', bag)
     assert done.returncode == 0, done.stderr
     assert re.search(rf'/{topics.SIGNALS} +\d\d+ messages\n', done.stdout)
@@ -111,15 +107,12 @@ def test_a_bag_is_read_while_it_is_recorded_and_complete_after_a_signal_amid_a_f
         assert found.record.samples > 50
         refused = recorder('--repair', bag)
         assert (refused.returncode, refused.stderr) == (
-            1, f'recorder: {bag}: is being recorded: stop its recorder first\n'
-        )
+            1, f'recorder: {bag}: is being recorded: stop its recorder first\n')
         flood = probe.publisher(topics.REFERENCE, Float64)
         probe.wait_until(flood.get_subscription_count, 'the recorder')
-
         def pour() -> None:
             for _ in range(100):
                 flood.publish(Float64(data=1.0))
-
         (file,) = message_files(bag)
         size = file.stat().st_size
         wait_until(lambda: file.stat().st_size > size + 100_000, 'messages in the bag', pour)
@@ -142,11 +135,9 @@ def test_full_disk_stops_the_recording_and_nothing_else(tmp_path: Path) -> None:
         heard = probe.collect(topics.SIGNALS, Float64MultiArray)
         diagnostics = probe.collect(topics.DIAGNOSTICS, DiagnosticArray)
         nodes = start_loop(world, bag, 'sqlite3')
-
         def recorded() -> int:
             told = nodes['recorder'].events('progress')
             return int(told[-1]['received'][topics.SIGNALS]) if told else 0
-
         probe.wait_until(lambda: recorded() > 60, 'a recording')
         # As a file system does that is full: what goes beyond is refused.
         size = max(path.stat().st_size for path in bag.iterdir())
@@ -161,13 +152,11 @@ def test_full_disk_stops_the_recording_and_nothing_else(tmp_path: Path) -> None:
                 status.level == DiagnosticStatus.ERROR
                 and reason in [pair.value for pair in status.values]
                 for message in diagnostics for status in message.status
-            ), 'the error in the diagnostics',
-        )
+            ), 'the error in the diagnostics')
         told = len(nodes['recorder'].events('progress'))
         go_on(probe, heard, 50)
         probe.wait_until(
-            lambda: len(nodes['recorder'].events('progress')) > told, 'further progress'
-        )
+            lambda: len(nodes['recorder'].events('progress')) > told, 'further progress')
         codes = {name: nodes[name].stop() for name in reversed(NODES)}
         assert codes == {'plant': 0, 'reference': 0, 'controller': 0, 'recorder': 1}
         log = nodes['recorder'].stderr

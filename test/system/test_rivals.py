@@ -34,8 +34,7 @@ class Stage:
         # The topics of both keep the names under which the driver listens.
         same = [
             part for topic in (topics.ESTIMATES, topics.SIGNALS)
-            for part in ('-r', f'{topics.of_node(topic)}:={topic}')
-        ]
+            for part in ('-r', f'{topics.of_node(topic)}:={topic}')]
         values = {'control.rate_max': RATE_MAX, **OF_THE_LOOP}
         return self.world.start('controller', values, '-r', f'__node:={name}', *same)
 
@@ -44,12 +43,10 @@ class Stage:
         return next((each for each in reversed(found) if each.name == name), None)
 
     def names_as_error(self, name: str, rival: str) -> bool:
-        """Whether a controller says at level ERROR who else there is."""
         status = self.status(name)
         return (
             status is not None and status.level == DiagnosticStatus.ERROR
-            and rival in status.message
-        )
+            and rival in status.message)
 
     def run_until(self, condition: Callable[[], object], what: str) -> None:
         self.driver.run_until(condition, what)
@@ -72,8 +69,7 @@ def test_the_later_controller_stands_down_until_the_first_one_has_gone_or_is_dea
         second = stage.start('second')
         stage.run_until(
             lambda: stage.names_as_error('first', '/second')
-            and stage.names_as_error('second', '/first'), 'both to name the other',
-        )
+            and stage.names_as_error('second', '/first'), 'both to name the other')
         stage.driver.run(50)
         status = stage.status('second')
         assert 'standing down' in status.message
@@ -89,8 +85,7 @@ def test_the_later_controller_stands_down_until_the_first_one_has_gone_or_is_dea
         third = stage.start('third')
         stage.run_until(
             lambda: 'waiting for discovery of another controller of /control' in third.stderr,
-            'a word about it',
-        )
+            'a word about it')
         assert stage.samples('third') == 0
         second.send(signal.SIGCONT)
         stage.run_until(lambda: stage.names_as_error('third', '/second'), 'the third to tell')
@@ -126,8 +121,7 @@ def test_another_program_is_given_way_to_where_it_was_first_and_named_where_not(
         stage.run_until(lambda: stage.samples('second') > samples + 50, 'commands')
         stage.run_until(
             lambda: any('reference is published by /probe' in pair.value
-                        for pair in stage.status('second').values), 'a word about the reference',
-        )
+                        for pair in stage.status('second').values), 'a word about the reference')
         assert controller.stop() == 0
 
 
@@ -136,7 +130,6 @@ UNCERTAIN: dict[str, object] = {'plant.uncertainty': 0.2}
 
 
 def workers_of(controller: NodeProcess) -> list[int]:
-    """Process ids of the workers that a controller has started and that still run."""
     found = []
     for child in psutil.Process(controller.process.pid).children():
         with suppress(psutil.Error):  # it has ended meanwhile

@@ -36,14 +36,12 @@ def asked_by_the_reference(structure: str, condition: str) -> float:
     changes = {
         **CONDITIONS[condition].changes, 'backlash.c_r': 1e-9, 'backlash.c_l': -1e-9,
         'estimator.initial.m': 1.3, 'estimator.initial.c_r': 0.0, 'estimator.initial.c_l': 0.0,
-        'control.min': -inf, 'control.max': inf, 'control.rate_max': inf, 'output_noise_std': 0.0,
-    }
+        'control.min': -inf, 'control.max': inf, 'control.rate_max': inf, 'output_noise_std': 0.0}
     without = CONDITIONS[condition]._replace(changes=changes, driver_limit=inf)
     return max(abs(sample.u_d) for sample in run('fixed', structure, without))
 
 
-@pytest.fixture(params=[(*pair, name) for pair in FIT for name in CONDITIONS],
-                ids='-'.join)
+@pytest.fixture(params=[(*pair, name) for pair in FIT for name in CONDITIONS], ids='-'.join)
 def loop(request: pytest.FixtureRequest) -> Loop:
     found: Loop = request.param
     return found

@@ -17,25 +17,15 @@ from backlash_ros.core.control.controller import LONGEST_WAIT, AdaptiveControlle
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.limits import Limits
 from backlash_ros.core.control.protocol import ControlStructure
-from backlash_ros.core.control.tracking.design import (
-    TrackingDesign,
-    better_design,
-    design,
-    modulus_margin,
-)
+from backlash_ros.core.control.tracking import design as designs
 from backlash_ros.core.control.tracking.tracking import Tracking
 from backlash_ros.core.law import Interval, Law, LawReport
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.parameters.table import TrackingWeights
 from backlash_ros.core.plant.simulated_plant import SimulatedPlant, delayed
 from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
+from backlash_ros.core.simulation import run_record
 from backlash_ros.core.simulation.closed_loop import ClosedLoop
-from backlash_ros.core.simulation.run_record import (
-    FREQUENCIES,
-    LearnedModel,
-    from_fields,
-    learned_model_of,
-)
 
 MOTOR = Parameters({
     'sample_period': 0.005, 'plant.numerator': [0.1513, 0.1325],
@@ -46,8 +36,8 @@ MOTOR = Parameters({
 })
 
 
-def learned(loop: ClosedLoop) -> LearnedModel:
-    return learned_model_of(loop.controller.estimator, loop.p)
+def learned(loop: ClosedLoop) -> run_record.LearnedModel:
+    return run_record.learned_model_of(loop.controller.estimator, loop.p)
 
 
 def report(loop: ClosedLoop) -> LawReport:
@@ -73,7 +63,7 @@ def test_what_was_learned_is_as_sure_as_it_says() -> None:
     p = MOTOR.replaced({'truth.scale_frequency': 1.1, 'output_noise_std': 2e-3})
     found = build_closed_loop(p).run(1200).learned
     assert found.denominator != p.plant.denominator
-    z = np.exp(2j * np.pi * np.array(FREQUENCIES))
+    z = np.exp(2j * np.pi * np.array(run_record.FREQUENCIES))
     gain = [build_true_model(p).response(np.ones(1, complex)), build_model(p).response(
         np.ones(1, complex))]
     response = TransferFunction(found.numerator, found.denominator).response(z) \
@@ -86,25 +76,22 @@ def test_what_was_learned_is_as_sure_as_it_says() -> None:
 
 @given(st.lists(st.floats(-5.0, 5.0), min_size=1, max_size=4), st.integers(0, 5))
 def test_fields_hold_all(numbers: list[float], delay: int) -> None:
-    model = LearnedModel(
-        tuple(numbers), (1.0, *numbers), delay, (0.1, 0.2, 0.3, 0.4, 0.5), 1.1, 0.02
-    )
-    assert from_fields(model.fields()) == model
+    model = run_record.LearnedModel(
+        tuple(numbers), (1.0, *numbers), delay, (0.1, 0.2, 0.3, 0.4, 0.5), 1.1, 0.02)
+    assert run_record.from_fields(model.fields()) == model
     missing = {k: v for k, v in model.fields().items() if k != 'unexplained'}
     with pytest.raises(KeyError):
-        from_fields(missing)
+        run_record.from_fields(missing)
 
 
 def test_wrong_sign_is_told_until_there_is_an_estimate() -> None:
     turned = {
         'truth.numerator': [-b for b in MOTOR.plant.numerator],
-        'truth.denominator': list(MOTOR.plant.denominator),
-    }
+        'truth.denominator': list(MOTOR.plant.denominator)}
     loop = build_closed_loop(MOTOR.replaced(turned))
     assert not report(loop).wrong_sign
     loop.run(400)
     assert report(loop).wrong_sign
-    # Somebody turns the sensor.
     measure = loop.plant.measure
     loop.plant.measure = lambda: -measure()  # type: ignore[method-assign]
     loop.run(800)
@@ -182,7 +169,7 @@ def run(
 ) -> Run:
     model, better = StateModel(told), StateModel(true)
     learner = Learner(model, better, after, 0.1)
-    structure = Tracking(design(model, WEIGHTS), WEIGHTS, 1.0, NOISE)
+    structure = Tracking(designs.design(model, WEIGHTS), WEIGHTS, 1.0, NOISE)
     controller = AdaptiveController(learner, structure, BacklashInverse(), Limits(), redesign=True)
     rng = np.random.default_rng(1)
     plant = SimulatedPlant(Parameters({
@@ -240,8 +227,9 @@ def test_a_loop_that_the_told_model_makes_unstable_is_rescued() -> None:
 
 def redesigned(
     told: TransferFunction, better: TransferFunction, weights: TrackingWeights,
-) -> TrackingDesign | None:
-    return better_design(StateModel(better), weights, design(StateModel(told), weights))
+) -> designs.TrackingDesign | None:
+    present = designs.design(StateModel(told), weights)
+    return designs.better_design(StateModel(better), weights, present)
 
 
 def test_feedback_softens_until_the_loop_is_as_safe_as_the_one_it_replaces() -> None:
@@ -249,14 +237,13 @@ def test_feedback_softens_until_the_loop_is_as_safe_as_the_one_it_replaces() -> 
     assert safe.feedback.state == pytest.approx(safe.plans[0].gains.state)
     # With an integral the loop around a motor half as fast would keep less than around either.
     weights = TrackingWeights(60, 1e-2, 1e-3)
-    present = design(StateModel(motor()), weights)
+    present = designs.design(StateModel(motor()), weights)
     softer = redesigned(motor(), motor(0.5), weights)
-    nominal = design(softer.model, weights)
-    had = min(modulus_margin(plant, present.model, present.feedback)
+    nominal = designs.design(softer.model, weights)
+    had = min(designs.modulus_margin(plant, present.model, present.feedback)
               for plant in (present.model, softer.model))
-    assert modulus_margin(softer.model, softer.model, nominal.feedback) < had
-    assert modulus_margin(softer.model, softer.model, softer.feedback) >= had
-    # The trajectory is not slower for it.
+    assert designs.modulus_margin(softer.model, softer.model, nominal.feedback) < had
+    assert designs.modulus_margin(softer.model, softer.model, softer.feedback) >= had
     assert softer.plans[0].gains.preview == pytest.approx(nominal.plans[0].gains.preview)
 
 

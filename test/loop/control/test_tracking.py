@@ -19,15 +19,8 @@ from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import TrackingWeights
 from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
 from backlash_ros.core.reference.signal import ReferenceSignal
+from backlash_ros.core.simulation import run_record
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
-from backlash_ros.core.simulation.run_record import (
-    COLUMNS,
-    RunRecord,
-    delayed_reference,
-    delayed_tracking_error_rms,
-    gap_crossings_per_reversal,
-    turns,
-)
 
 NO_GAP = {'backlash.c_r': 1e-9, 'backlash.c_l': -1e-9}
 KNOWN = {'estimator.law': 'fixed', 'estimator.initial.m': 1.3}
@@ -42,17 +35,17 @@ def tracking(**changes: object) -> Parameters:
     return Parameters({**known, **named})
 
 
-def simulate(p: Parameters, samples: int, y_m: np.ndarray | None = None) -> RunRecord:
+def simulate(p: Parameters, samples: int, y_m: np.ndarray | None = None) -> run_record.RunRecord:
     loop = build_closed_loop(p)
     if y_m is not None:
         loop.reference = ReferenceSignal(
-            Parameters({'waveform': 'file', 'amplitude': 1.0}), tuple(y_m.tolist())
-        )
+            Parameters({'waveform': 'file', 'amplitude': 1.0}), tuple(y_m.tolist()))
     return loop.run(samples)
 
 
 def error(p: Parameters, samples: int = 500) -> float:
-    value = delayed_tracking_error_rms(simulate(p, samples), p.tracking.preview, since=2.0)
+    run = simulate(p, samples)
+    value = run_record.delayed_tracking_error_rms(run, p.tracking.preview, since=2.0)
     assert value is not None
     return value
 
@@ -61,7 +54,6 @@ def error(p: Parameters, samples: int = 500) -> float:
 def test_learned_backlash_costs_nothing(amplitude: float) -> None:
     p = tracking(amplitude=amplitude)
     ideal = error(p.replaced({**GAPLESS, **NO_GAP}))
-    # What may be noise is left alone.
     assert error(p) <= 1.02 * ideal + 0.3 * p.estimator.output_noise_std / amplitude
 
 
@@ -96,12 +88,10 @@ def test_v_rests_however_long_it_takes_to_cross_the_gap(motor, take_up):
     w *= np.pi
     denominator = np.polymul([lag, 1.0], [1.0, 2.0 * damping * w, w * w])
     numerator, denominator, _ = signal.cont2discrete(
-        ([w * w], denominator[denominator.nonzero()[0][0]:]), 0.005, 'zoh'
-    )
+        ([w * w], denominator[denominator.nonzero()[0][0]:]), 0.005, 'zoh')
     p = Parameters({
         **GEAR, 'plant.numerator': numerator[0][1:].tolist(),
-        'plant.denominator': denominator.tolist(), 'inverse.take_up_rate': take_up,
-    })
+        'plant.denominator': denominator.tolist(), 'inverse.take_up_rate': take_up})
     loop = build_closed_loop(p)
     moving = loop.reference
     loop.reference = lambda t: moving(min(t, stop))
@@ -132,7 +122,7 @@ def test_v_comes_to_rest_after_a_motion_in_spite_of_noise(seed: int) -> None:
     v = run.column('v')[1000:]
     # G integrates what is left of u, so y may have to be brought back: there and back again.
     assert np.count_nonzero(np.diff(v)) <= 10
-    assert turns(v, 3.0) <= 2
+    assert run_record.turns(v, 3.0) <= 2
     model = build_model(p)
     y = signal.lfilter(model.numerator, model.denominator, run.column('u'))
     assert np.abs(y[1000:] - y_m[-1]).max() < 6.0 * sigma
@@ -173,8 +163,7 @@ def test_reference_that_begins_slowly_is_followed_from_two_seconds_on(seed: int)
     # believe a wrong gap with these noises; the fit of all samples does not.
     chirp = {
         'waveform': 'chirp', 'frequency_start': 0.2 * np.pi, 'frequency': 6.0 * np.pi,
-        'output_noise_std': 1e-3, 'seed': seed,
-    }
+        'output_noise_std': 1e-3, 'seed': seed}
     p = tracking(**chirp)
     assert np.abs(simulate(p, 400).column('y')).max() < 0.3
     assert error(p, 1200) <= 1.1 * error(p.replaced({**GAPLESS, **NO_GAP}), 1200)
@@ -210,41 +199,42 @@ def test_saturation_and_rate_limit_leave_no_cycle_behind(law: str) -> None:
     assert np.abs(run.column('y')[700:]).max() < 0.105
 
 
-def record(y_m: np.ndarray, y: np.ndarray, v: np.ndarray | None = None) -> RunRecord:
-    rows = np.zeros((len(y_m), len(COLUMNS)))
+def record(y_m: np.ndarray, y: np.ndarray, v: np.ndarray | None = None) -> run_record.RunRecord:
+    rows = np.zeros((len(y_m), len(run_record.COLUMNS)))
     for name, values in {
         't': np.arange(len(y_m)) * 0.01, 'y_m': y_m, 'y': y, 'v': y if v is None else v,
         'true_c_r': 1.0, 'true_c_l': -1.0,
     }.items():
-        rows[:, COLUMNS.index(name)] = values
-    return RunRecord(rows, 0.01)
+        rows[:, run_record.COLUMNS.index(name)] = values
+    return run_record.RunRecord(rows, 0.01)
 
 
 def test_delayed_copy_has_no_delayed_error() -> None:
     y_m = np.sin(0.1 * np.arange(300))
     y = np.concatenate([np.zeros(7), y_m[:-7]])
-    assert delayed_tracking_error_rms(record(y_m, y), 7) == pytest.approx(0.0, abs=1e-12)
-    assert delayed_tracking_error_rms(record(0.0 * y_m, y), 7) is None
+    assert run_record.delayed_tracking_error_rms(record(y_m, y), 7) == pytest.approx(0.0, abs=1e-12)
+    assert run_record.delayed_tracking_error_rms(record(0.0 * y_m, y), 7) is None
 
 
 def test_delay_counts_sample_periods_where_samples_were_lost() -> None:
     y_m = np.arange(100.0)
     whole = record(y_m, y_m)
-    kept = RunRecord(np.delete(whole.rows, [40, 41], axis=0), 0.01, 2)
-    assert delayed_reference(kept, 5)[-1] == 94.0
+    kept = run_record.RunRecord(np.delete(whole.rows, [40, 41], axis=0), 0.01, 2)
+    assert run_record.delayed_reference(kept, 5)[-1] == 94.0
 
 
 def test_turns_counts_what_turns_back_by_more_than_the_least() -> None:
-    assert turns(np.array([0.0, 2.0, 0.0, 2.0, 1.5, 3.0]), 1.0) == 2
-    assert (turns(np.array([0.0, 2.0, 1.5, 2.0]), 1.0), turns(np.empty(0), 1.0)) == (0, 0)
+    assert run_record.turns(np.array([0.0, 2.0, 0.0, 2.0, 1.5, 3.0]), 1.0) == 2
+    assert run_record.turns(np.array([0.0, 2.0, 1.5, 2.0]), 1.0) == 0
+    assert run_record.turns(np.empty(0), 1.0) == 0
 
 
 def test_crossings_are_counted_per_reversal_of_the_reference() -> None:
     y_m = np.sin(0.1 * np.arange(630))
     v = 2.0 * y_m + np.sign(np.gradient(y_m))
-    assert gap_crossings_per_reversal(record(y_m, y_m, v)) == pytest.approx(1.0)
+    assert run_record.gap_crossings_per_reversal(record(y_m, y_m, v)) == pytest.approx(1.0)
     chatter = v + 2.0 * (np.arange(630) % 2)
-    value = gap_crossings_per_reversal(record(y_m, y_m, chatter))
+    value = run_record.gap_crossings_per_reversal(record(y_m, y_m, chatter))
     assert value > 10.0
 
 

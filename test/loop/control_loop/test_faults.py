@@ -38,13 +38,11 @@ def test_absurd_numbers_are_dropped_counted_and_change_nothing() -> None:
 @pytest.mark.parametrize(('share', 'published'), [(0.01, False), (0.1, True), (0.3, False)])
 def test_lost_outputs_leave_the_estimates_within_5_percent(share: float, published: bool) -> None:
     world = SimulatedLoop()
-
     def lose(k: int, output: Output) -> list[Output]:
         if world.rng.random() > share:
             return [output]
         world.driver.number -= not published  # then the numbers have no gap
         return []
-
     world.fault = lose
     world.run(400)
     statistics = world.loop.statistics
@@ -71,7 +69,6 @@ def test_reports_of_an_encoder_with_another_zero_still_teach_the_crossings_of_v(
     assert world.loop.commands.origin.value == pytest.approx(origin)
     assert world.error() < 0.02
     assert world.rows[-1].status is Status.TRACKING
-    # An encoder that is zeroed while the driver is gone.
     world.driver.down_until = world.driver.tick + 200
     world.driver.origin = 0.1
     world.run(800)
@@ -205,15 +202,12 @@ def first_command(heard_at: int, reported_at: int) -> float:
     p = Parameters({'control.min': -10.0, 'control.max': 10.0, 'control.rate_max': 100.0 * MOVE})
     loop = ControlLoop(
         p, sent.append, Driver(lambda: now[0] * PERIOD_NS), None,
-        SampleCounter(0.01, from_zero=False), 0.0,
-    )
-
+        SampleCounter(0.01, from_zero=False), 0.0)
     def answer(k: int) -> None:
         now[0] = k
         stamp_ns = k * PERIOD_NS
         loop.take_reference(0.0)
         loop.answer(Output(0.0, stamp_ns, stamp_ns, stamp_ns, k))
-
     answer(1)
     loop.stand_down()
     for k in range(2, 8):
@@ -237,10 +231,8 @@ def test_reports_are_heard_first_where_a_gap_makes_the_loop_begin_again() -> Non
     loop = ControlLoop(
         Parameters({
             'timeout.plant_output': 0.05, 'control.min': -10.0, 'control.max': 10.0,
-            'control.rate_max': 10.0,
-        }),
-        lambda v: None, Driver(lambda: stamp_ns), None, SampleCounter(0.01), 0.0,
-    )
+            'control.rate_max': 10.0}),
+        lambda v: None, Driver(lambda: stamp_ns), None, SampleCounter(0.01), 0.0)
     loop.take_reference(0.0)
     for k in (1, 2, 3, back):
         stamp_ns = k * PERIOD_NS

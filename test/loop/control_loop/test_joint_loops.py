@@ -22,8 +22,7 @@ def parameters() -> Parameters:
     values: dict[str, object] = {
         'joints': JOINTS, 'sample_period': PERIOD, 'control.rate_max': 20.0,
         'estimator.law': 'lms', 'estimator.initial.c_r': 0.02, 'estimator.initial.c_l': -0.02,
-        'estimator.initial.m': 1.0, 'proportional.f': 0.0,
-    }
+        'estimator.initial.m': 1.0, 'proportional.f': 0.0}
     for k, joint in enumerate(JOINTS[:-1]):
         pole = 0.5 + 0.1 * k
         values |= {f'{joint}.plant.numerator': [1.0 - pole],
@@ -35,10 +34,8 @@ def run(spoil: Spoil, samples: int = SAMPLES) -> dict[str, list[float]]:
     """Commands of each joint, a number per sample; nan where none was sent."""
     sent: dict[str, list[float]] = {joint: [] for joint in JOINTS}
     newest: dict[str, float] = {}
-
     def send(commands: Mapping[str, float]) -> None:
         newest.update(commands)
-
     p = parameters()
     before = {joint: first_guess(p.of_joint(joint)) for joint in JOINTS}
     loops = JointLoops(p, send, lambda joint: Driver(lambda: now_ns), before, SampleCounter(PERIOD))
@@ -51,8 +48,7 @@ def run(spoil: Spoil, samples: int = SAMPLES) -> dict[str, list[float]]:
         newest.clear()
         loops.answer({
             joint: Output(value, now_ns, now_ns, now_ns, k, False)
-            for joint, value in spoil(k, dict(y)).items()
-        })
+            for joint, value in spoil(k, dict(y)).items()})
         for i, joint in enumerate(JOINTS):
             sent[joint].append(newest.get(joint, nan))
             v[joint] = newest.get(joint, v[joint])
@@ -65,9 +61,7 @@ def test_a_thousand_faults_of_a_joint_change_no_command_of_another_by_a_bit() ->
     rng = np.random.default_rng(1)
     faults = dict(zip(
         rng.choice(SAMPLES - 1, FAULTS, replace=False) + 1, rng.integers(5, size=FAULTS),
-        strict=True,
-    ))
-
+        strict=True))
     def spoil(k: int, y: Outputs) -> Outputs:
         if k not in faults:
             return y
@@ -75,13 +69,10 @@ def test_a_thousand_faults_of_a_joint_change_no_command_of_another_by_a_bit() ->
         names = list(rng.permutation(JOINTS))
         return {
             name: bad if name == 'elbow' else y[name] for name in names
-            if name != 'elbow' or bad is not None
-        }
-
+            if name != 'elbow' or bad is not None}
     alone, beside = run(lambda k, y: y), run(spoil)
     for joint in JOINTS:
         same = np.array_equal(alone[joint], beside[joint], equal_nan=True)
         assert same == (joint != 'elbow')
-    # A sensor that has nothing to say is not answered, one that lies is.
     unanswered = sum(map(isnan, beside['elbow']))
     assert unanswered == sum(fault != 3 for fault in faults.values())

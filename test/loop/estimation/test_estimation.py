@@ -81,22 +81,17 @@ def test_crossings_walk_with_a_disturbance_of_u(known: float) -> None:
 @pytest.mark.parametrize('what', ['never excited', 'v is limited', 'at rest'])
 def test_estimates_freeze_while_v_stays_within_the_gap(what: str) -> None:
     changes: dict[str, dict[str, float]] = {
-        'never excited': {'amplitude': 0.3}, 'at rest': {'proportional.f': 0.0},
-    }
+        'never excited': {'amplitude': 0.3}, 'at rest': {'proportional.f': 0.0}}
     loop = build_closed_loop(Parameters({
-        **EXACT, 'output_noise_std': 1e-3, **changes.get(what, {}),
-    }))
+        **EXACT, 'output_noise_std': 1e-3, **changes.get(what, {})}))
     begin = 0 if what == 'never excited' else 300
     if what == 'at rest':
         loop.reference = lambda t: 10.0 * sin(12.6 * min(t, 0.01 * begin))
-
     reference = loop.reference
-
     def limited(t: float) -> float:
         if what == 'v is limited' and round(t / 0.01) == begin:
             loop.controller.limits = Limits(-2.0, 2.0)
         return reference(t)
-
     loop.reference = limited
     run = loop.run(2500)
     status = run.column('status')
@@ -110,8 +105,7 @@ def test_estimates_freeze_while_v_stays_within_the_gap(what: str) -> None:
 def test_two_values_of_v_leave_open_whether_slope_or_gap_is_larger() -> None:
     p = Parameters({
         **motor(), 'waveform': 'square', 'amplitude': 0.2, 'frequency': 4.0,
-        'control.rate_max': 1e6, 'seed': 1,
-    })
+        'control.rate_max': 1e6, 'seed': 1})
     loop = build_closed_loop(p)
     run = loop.run(1600)
     assert not (run.column('status') == Status.TRACKING).any()
@@ -124,8 +118,7 @@ def test_two_values_of_v_leave_open_whether_slope_or_gap_is_larger() -> None:
 def test_a_bound_that_keeps_a_good_estimate_back_is_named_with_what_was_found(name, value, bound):
     p = Parameters({
         **motor(), 'input_disturbance': 0.3, 'frequency': 4.0, f'estimator.bounds.{name}': bound,
-        'estimator.initial.m': 0.15, 'estimator.initial.c_r': 0.5,
-    })
+        'estimator.initial.m': 0.15, 'estimator.initial.c_r': 0.5})
     loop = build_closed_loop(p)
     run = loop.run(round(2 * 2.0 * np.pi / 4.0 / p.sample_period))
     assert (run.column('status') == Status.ACQUIRING).all()
@@ -147,8 +140,7 @@ NAMES = ('m', 'c_r', 'c_l')
 
 def run(samples: int, fault: Callable[[int, float], float], **changes: float) -> RunRecord:
     loop = build_closed_loop(Parameters({
-        'plant.uncertainty': 0.0, 'output_noise_std': NOISE, **changes,
-    }))
+        'plant.uncertainty': 0.0, 'output_noise_std': NOISE, **changes}))
     measure = loop.plant.measure
     loop.plant.measure = lambda: fault(loop.plant.sample, measure())  # type: ignore[method-assign]
     return loop.run(samples)
@@ -156,8 +148,7 @@ def run(samples: int, fault: Callable[[int, float], float], **changes: float) ->
 
 def errors(record: RunRecord, k: int) -> np.ndarray:
     return np.array([
-        abs(record.column(name)[k] / record.column(f'true_{name}')[k] - 1.0) for name in NAMES
-    ])
+        abs(record.column(name)[k] / record.column(f'true_{name}')[k] - 1.0) for name in NAMES])
 
 
 def test_one_wild_sample_moves_no_estimate_by_more_than_its_deviation() -> None:
@@ -227,7 +218,6 @@ def test_where_the_play_began_does_not_contradict_readings_that_were_rounded() -
     # Labels before the first engagement are the least sure ones, and intervals the sharpest data.
     p = Parameters({
         **read_configuration(SHIPPED / 'geared_motor.yaml').given(), 'structure': 'proportional',
-        'truth.scale_frequency': 0.8,
-    })
+        'truth.scale_frequency': 0.8})
     record = build_closed_loop(p).run(900)
     assert (record.column('status')[200:] == Status.TRACKING).all()

@@ -12,7 +12,6 @@ TRUE = np.array([1.3, 3.0, -3.0])
 
 
 def run(loop: ClosedLoop, controller: AdaptiveController, samples: int) -> list[Estimate]:
-    """What a controller estimates that goes on with the plant where it is."""
     estimates = []
     for _ in range(samples):
         y_m = loop.reference(loop.plant.sample * loop.sample_period)

@@ -145,11 +145,9 @@ def test_estimates_are_saved_at_the_end_and_on_request_or_the_reason_is_told(tmp
 
 def test_a_slow_disk_holds_up_the_answer_but_not_the_loop(tmp_path, monkeypatch):
     confirmed, fsync = threading.Event(), os.fsync
-
     def slowly(file: int) -> None:
         confirmed.wait()
         fsync(file)
-
     monkeypatch.setattr(os, 'fsync', slowly)
     file = tmp_path / 'estimates.json'
     with bench(**{'estimates.file': str(file), 'estimates.save_period': 0.0}) as made:
@@ -158,7 +156,6 @@ def test_a_slow_disk_holds_up_the_answer_but_not_the_loop(tmp_path, monkeypatch)
         made.wait_until(client.service_is_ready, 'the service')
         saved = client.call_async(Trigger.Request())
         try:
-            # Other requests are answered meanwhile.
             assert made.set_bool('freeze_adaptation', True)
             made.run(50)
             assert len(made.sent) == 350

@@ -41,8 +41,7 @@ class Arm:
         before, stamp_ns, arrived = len(self.sent), START_NS + PERIOD_NS * self._k, time.time_ns()
         self.node._on_output({
             joint: Output(value, stamp_ns, arrived, arrived, self._k, numbered=False)
-            for joint, value in y.items()
-        })
+            for joint, value in y.items()})
         return [joint for commands in self.sent[before:] for joint in commands]
 
     def commanded(self, y_m: float) -> dict[str, float]:
@@ -108,8 +107,7 @@ def test_joints_begin_where_they_stand() -> None:
         made.hear({'waist': 0.5, 'elbow': -0.25, 'gripper': 0.125})
         one_step = 1.0 * 0.02 * (1.0 + 1e-9)
         assert made.sent[0] == pytest.approx(
-            {'waist': 0.5, 'elbow': -0.25, 'gripper': 0.125}, abs=one_step
-        )
+            {'waist': 0.5, 'elbow': -0.25, 'gripper': 0.125}, abs=one_step)
 
 
 def test_joints_that_have_news_at_once_tell_them_one_per_sample() -> None:

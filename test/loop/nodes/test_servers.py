@@ -88,15 +88,12 @@ def loop() -> Iterator[Loop]:
 def test_a_flood_of_messages_stops_neither_timers_nor_services(loop: Loop) -> None:
     heard: list[float] = []
     ticks: list[int] = []
-
     def hear_and_say_again(message: Float64) -> None:
         heard.append(message.data)
         loop.publisher.publish(message)  # there is always one that waits
-
     def answer(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success = True
         return response
-
     loop.node.create_subscription(Float64, 'number', hear_and_say_again, 10)
     loop.node.create_service(Trigger, 'ask', answer)
     client = loop.node.create_client(Trigger, 'ask')

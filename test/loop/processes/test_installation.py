@@ -31,16 +31,14 @@ with exit_at_the_latest(0.5, 3):
 def test_a_process_ends_though_the_interpreter_is_locked() -> None:
     done = subprocess.run(
         (sys.executable, '-c', LEAVE), timeout=DEADLINE_S,
-        capture_output=True, text=True, check=False,
-    )
+        capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (3, 'all that was to be said\n'), done.stderr
 
 
 def test_a_signal_while_bringup_is_loaded_ends_it_in_one_line() -> None:
     program = (
         'import os, signal, sys; sys.argv = ["bringup"]; import backlash_ros.tools.bringup;'
-        'os.kill(os.getpid(), signal.SIGINT)'
-    )
+        'os.kill(os.getpid(), signal.SIGINT)')
     done = subprocess.run((sys.executable, '-c', program), capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (1, 'bringup: interrupted\n')
 
@@ -62,8 +60,7 @@ def make(*arguments: str, cwd: Path, **environment: str) -> subprocess.Completed
     inherited = {name: value for name, value in os.environ.items() if name not in NOT_INHERITED}
     return subprocess.run(
         ['make', *arguments],
-        cwd=cwd, env={**inherited, **environment}, capture_output=True, text=True,
-    )
+        cwd=cwd, env={**inherited, **environment}, capture_output=True, text=True)
 
 
 @pytest.fixture
@@ -151,12 +148,10 @@ def called(libraries: Path, folder: Path, *arguments: str) -> subprocess.Complet
     # -S: nothing that is installed for this interpreter is there.
     environment = {
         name: value for name, value in os.environ.items()
-        if not name.startswith(('ROS_', '_ROS', 'AMENT_', 'LD_LIBRARY_PATH'))
-    }
+        if not name.startswith(('ROS_', '_ROS', 'AMENT_', 'LD_LIBRARY_PATH'))}
     return subprocess.run(
         [sys.executable, '-S', *arguments], cwd=folder, capture_output=True, text=True,
-        env={**environment, 'PYTHONPATH': str(libraries)}, timeout=500,
-    )
+        env={**environment, 'PYTHONPATH': str(libraries)}, timeout=500)
 
 
 def test_what_needs_no_ros_works_and_the_rest_says_so_in_one_line(libraries, tmp_path):

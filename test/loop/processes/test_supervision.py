@@ -50,7 +50,6 @@ def watch(
     """Run bringup's loop over Python programs given by name; none of them is left at the end."""
     mark = uuid.uuid4().hex
     monkeypatch.setenv(MARK, mark)
-
     def watch_programs(hurry: bool = False, **programs: str) -> Watched:
         parameters = effective_parameters(None).replaced({'samples': 100})
         axis = AxisPlan('', parameters, tmp_path, record=False)
@@ -59,13 +58,11 @@ def watch(
             [Child(
                 name, (sys.executable, '-c', program), axis.logs / f'{name}.log',
                 child_environment(axis.logs, None), foreign=name == 'driver',
-            )] for name, program in programs.items()
-        ]
+            )] for name, program in programs.items()]
         with ProcessSupervisor(stages, lambda: hurry) as supervisor:
             run = watching.RunWatch(RunPlan((axis,)), supervisor, StopRequests())
             run.execute()
         return Watched(run.failure, capsys.readouterr().err, mark)
-
     yield watch_programs
     for pid in marked_processes(mark):
         os.kill(pid, signal.SIGKILL)
@@ -80,7 +77,6 @@ def test_a_process_that_is_never_ready_is_named_with_the_end_of_its_log(
     assert run.failure.startswith('not ready within 5 s: slow\n')
     assert '    129' in run.complaint
     assert '    119' not in run.complaint
-    # What is no event stands in the log.
     assert (tmp_path / 'logs' / 'slow.log').read_text().startswith('hello\n100\n')
 
 
@@ -89,8 +85,7 @@ def test_what_ends_by_itself_ends_all_the_deaf_and_their_children_included(watch
     mortal = (
         'import os, sys, time\n'
         f'while not os.path.exists({str(file)!r}): time.sleep(0.01)\n'
-        'sys.exit("no memory left")'
-    )
+        'sys.exit("no memory left")')
     run = watch(hurry=True, deaf=f'{DEAF}{begun(file)}time.sleep(600)', mortal=mortal)
     assert run.failure.startswith('mortal died (exit code 1)')
     assert 'no memory left' in run.complaint
@@ -99,8 +94,7 @@ def test_what_ends_by_itself_ends_all_the_deaf_and_their_children_included(watch
 
 def test_stages_end_one_after_the_other_each_with_the_time_that_it_needs(tmp_path, monkeypatch):
     monkeypatch.setattr(supervising, 'ESCALATION', (
-        (signal.SIGINT, 0.2), (signal.SIGTERM, 0.2), (signal.SIGKILL, DEADLINE_S),
-    ))
+        (signal.SIGINT, 0.2), (signal.SIGTERM, 0.2), (signal.SIGKILL, DEADLINE_S)))
     files, gone = [tmp_path / f'begun{i}' for i in range(3)], tmp_path / 'gone'
     patient = f'{READY}; {begun(files[0])} {WAIT}; import time; time.sleep(0.6); {begun(gone)}'
     after = f'{READY}; {begun(files[1])} {WAIT}; import os; print(os.path.exists({str(gone)!r}))'
@@ -109,8 +103,7 @@ def test_stages_end_one_after_the_other_each_with_the_time_that_it_needs(tmp_pat
         [Child(
             str(i), (sys.executable, '-c', program), tmp_path / f'{i}.log',
             child_environment(tmp_path, None), foreign=True, grace_s=DEADLINE_S * (i < 2),
-        )] for i, program in enumerate((patient, after, deaf))
-    ]
+        )] for i, program in enumerate((patient, after, deaf))]
     with ProcessSupervisor(stages, lambda: False) as supervisor:
         wait_until(lambda: all(file.exists() for file in files), 'all programs have begun')
         supervisor.stop()

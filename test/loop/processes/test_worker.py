@@ -49,11 +49,9 @@ def executor() -> Iterator[WorkerExecutor]:
 def result_of(channel: Channel) -> object:
     assert channel.busy
     results: list[object] = []
-
     def has_come() -> bool:
         results.append(channel.poll())
         return not channel.busy
-
     wait_until(has_come, 'a result', lambda: time.sleep(1e-3))
     return results[-1]
 
@@ -161,7 +159,6 @@ RUNS = ['--duration', '1', '--set', 'output_noise_std=1e-3', '--seeds', '6']
 def test_a_killed_worker_loses_no_run_and_no_bit(tmp_path: Path) -> None:
     distributed = pytest.importorskip('distributed')
     remote, local = tmp_path / 'remote', tmp_path / 'local'
-    # Nothing listens beyond this machine.
     with distributed.LocalCluster(
         n_workers=1, threads_per_worker=1, host='127.0.0.1', dashboard_address=None,
         local_directory=str(tmp_path),
@@ -170,14 +167,12 @@ def test_a_killed_worker_loses_no_run_and_no_bit(tmp_path: Path) -> None:
             [sys.executable, '-m', 'backlash_ros.tools.simulate', *RUNS, '--out', str(remote),
              '--cluster', cluster.scheduler_address],
             env=with_source(os.environ), stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-            text=True,
-        )
+            text=True)
         try:
             worker = cluster.workers[0]
             wait_until(
                 lambda: client.processing()[worker.worker_address]
-                or simulation.poll() is not None, 'runs of the worker',
-            )
+                or simulation.poll() is not None, 'runs of the worker')
             os.kill(worker.pid, signal.SIGKILL)
             assert main([*RUNS, '--out', str(local)]) == 0
             said, _ = simulation.communicate(timeout=4.0 * DEADLINE_S)

@@ -16,7 +16,7 @@ from places import ROOT
 from strategies import output_of, paper_example
 from waiting import DEADLINE_S, wait_until
 
-from backlash_ros.core import Parameters, build_closed_loop
+from backlash_ros.core import Parameters, build_closed_loop, build_controller
 from backlash_ros.core.plant.transfer_function import TransferFunction
 from backlash_ros.core.simulation.run_record import control_error_rms, settling_time
 from backlash_ros.tools import batch
@@ -84,18 +84,15 @@ def test_sweep_runs_every_combination_for_every_seed(tmp_path: Path) -> None:
     rows = rows_of(tmp_path / 'sweep.csv')
     assert [(row['output_noise_std'], row['estimator.law'], row['seed']) for row in rows] == [
         (noise, law, seed)
-        for noise in ('0.0001', '0.001') for law in ('lms', 'printed') for seed in ('1', '2')
-    ]
+        for noise in ('0.0001', '0.001') for law in ('lms', 'printed') for seed in ('1', '2')]
 
 
 @pytest.mark.parametrize(('arguments', 'message'), [
     (['--set', 'sed=1'], 'did you mean seed?'),
     (['--config', 'nothing.yaml'], 'nothing.yaml: cannot be read'),
     (['--duration', '0.015'], 'whole multiple of sample_period=0.01'),
-    (['--duration', '-1'], 'must be finite and > 0'),
-    (['--duration', 'x'], "invalid float value: 'x'"),
-    (['--seeds', '0'], '--seeds=0 must be >= 1'),
-    (['--seed', '-1'], 'seed=-1'),
+    (['--duration', '-1'], 'must be finite and > 0'), (['--seed', '-1'], 'seed=-1'),
+    (['--duration', 'x'], "invalid float value: 'x'"), (['--seeds', '0'], '--seeds=0 must be >= 1'),
     (['--sweep', 'seed=1,2', '--seeds', '2'], 'exclude each other'),
     (['--sweep', 'seed'], 'must be KEY=v1,v2,...'),
     (['--sweep', 'seed=1', '--sweep', 'seed=2'], 'names seed twice'),
@@ -118,8 +115,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(
 def outcome(error: float, settling: float | None) -> Outcome:
     return {
         'm': 2.0 + error, 'c_r': 4.0, 'c_l': -4.0, 'true_m': 2.0, 'true_c_r': 4.0, 'true_c_l': -4.0,
-        'settling_m': settling, 'settling_c_r': 0.0, 'settling_c_l': 0.0, 'problem': '',
-    }
+        'settling_m': settling, 'settling_c_r': 0.0, 'settling_c_l': 0.0, 'problem': ''}
 
 
 def test_statistics_are_those_of_the_errors() -> None:
@@ -210,8 +206,7 @@ def test_bad_input_ends_with_one_line(capsys: pytest.CaptureFixture[str]) -> Non
 def test_learned_backlash_costs_less_than_an_uncompensated_one() -> None:
     merits = {
         result.name: dict(zip(COMPARISON_HEADER[1:], result.merits, strict=True))
-        for result in compare(Parameters(), 400)
-    }
+        for result in compare(Parameters(), 400)}
     learned, plain = merits['moving_horizon, tracking'], merits['no compensation, tracking']
     assert merits['no backlash, tracking']['backlash penalty'] == 0.0
     assert plain['backlash penalty'] > 0.0
@@ -224,13 +219,11 @@ def test_lms_learns_the_papers_backlash_to_1_percent_within_5_s() -> None:
         time = settling_time(run.column('t'), run.column(name), run.column(f'true_{name}'))
         assert time is not None, f'{name} ends at {run.column(name)[-1]}'
         assert time <= 5.0, name
-    error = control_error_rms(run)
-    assert error < 1e-3
+    assert control_error_rms(run) < 1e-3
 
 
 def test_row_holds_the_signals_of_one_sample() -> None:
-    loop = build_closed_loop(paper_example())
-    run = loop.run(300)
+    run = build_closed_loop(paper_example()).run(300)
     t, y_m, u_d, v, u = (run.column(name) for name in ('t', 'y_m', 'u_d', 'v', 'u'))
     np.testing.assert_allclose(t, 0.01 * np.arange(300))
     np.testing.assert_allclose(y_m, 10.0 * np.sin(12.6 * t))
@@ -248,10 +241,8 @@ def test_row_holds_the_signals_of_one_sample() -> None:
 ])
 @pytest.mark.parametrize('size', [5e-324, 1e-155, 1e-130])
 def test_commands_whose_square_is_hardly_a_number_are_harmless(law, structure, size):
-    parameters = Parameters({'estimator.law': law, 'structure': structure})
-    loop = build_closed_loop(parameters).controller
+    loop = build_controller(Parameters({'estimator.law': law, 'structure': structure}))
     for k in range(200):
-        # The plant is moved by something else.
         y, applied = np.sin(0.05 * k), [size * (k % 15 - 7)] if k else []
         step = loop.step(y, size * (k % 20 - 10), 0, applied)
         loop.refine()

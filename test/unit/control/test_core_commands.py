@@ -21,9 +21,7 @@ def as_printed(
 ) -> float:
     if u_d == u_d_before:
         return v_before
-    if u_d < u_d_before:
-        return u_d / m + c_l
-    return u_d / m + c_r
+    return u_d / m + (c_l if u_d < u_d_before else c_r)
 
 
 @given(samples=st.lists(st.tuples(plays(), st.floats(-100.0, 100.0)), min_size=1, max_size=40))
@@ -51,8 +49,7 @@ def test_noise_within_the_direction_band_never_turns_v(play, band, sign, noise, 
         v_before = v
 
 
-@given(play=usual_plays(), take_up=st.floats(0.1, 10.0), u_d=st.floats(0.5, 50.0),
-       signal=signals())
+@given(play=usual_plays(), take_up=st.floats(0.1, 10.0), u_d=st.floats(0.5, 50.0), signal=signals())
 def test_take_up_crosses_the_gap_with_limited_slope_and_then_arrives(play, take_up, u_d, signal):
     inverse = BacklashInverse(take_up=take_up)
     backlash = Backlash(play.m, play.c_r, play.c_l)
@@ -60,7 +57,6 @@ def test_take_up_crosses_the_gap_with_limited_slope_and_then_arrives(play, take_
         held, v_last = backlash.u, inverse.v
         v = inverse.step(target, play.m, play.c_r, play.c_l)
         u = backlash.step(v)
-        # What lies beyond the gap is free.
         assert abs(v - v_last) <= take_up + abs(u - held) / play.m + play.rounding(v)
     # The signal stays where it ends while v crosses: taking up must go on by itself.
     for _ in range(ceil(play.gap / take_up) + 2):

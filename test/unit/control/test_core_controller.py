@@ -35,8 +35,7 @@ def controller(
     estimator: Notebook, limits: Limits | None = None, inverse: BacklashInverse | None = None,
 ) -> AdaptiveController:
     return AdaptiveController(
-        estimator, Proportional(), inverse or BacklashInverse(), limits or Limits()
-    )
+        estimator, Proportional(), inverse or BacklashInverse(), limits or Limits())
 
 
 def test_output_is_paired_with_what_was_applied_before_it() -> None:
@@ -48,8 +47,7 @@ def test_output_is_paired_with_what_was_applied_before_it() -> None:
     c.refine()
     assert estimator.updates == [
         (0.1, Interval(first.v, 1.0, first.u_d, 0.22)),
-        (0.2, Interval(second.v, 2.0, second.u_d, 0.22)),
-    ]
+        (0.2, Interval(second.v, 2.0, second.u_d, 0.22))]
 
 
 def test_a_command_uses_what_its_output_has_taught() -> None:

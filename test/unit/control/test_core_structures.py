@@ -69,8 +69,7 @@ def test_f_near_or_beyond_m_is_limited(play: Play, y_m: float, share: float) -> 
     assert command.f == pytest.approx(LARGEST_SHARE * play.m)
     assert isfinite(command.u_d)
     assert command.u_d == pytest.approx(
-        y_m + command.f * command.v, abs=tolerance(play, y_m, command.u_d)
-    )
+        y_m + command.f * command.v, abs=tolerance(play, y_m, command.u_d))
     assert LARGEST_F_OVER_M == LARGEST_SHARE
 
 
@@ -98,13 +97,11 @@ def test_loop_without_backlash_answers_as_the_reference_model_says(filter_pole: 
         'structure': 'pole_placement', 'pole_placement.filter_pole': filter_pole,
         'estimator.law': 'fixed', 'estimator.initial.m': 1.3, 'estimator.initial.c_r': 0.0,
         'estimator.initial.c_l': 0.0, 'backlash.c_r': 1e-12, 'backlash.c_l': -1e-12,
-        'amplitude': 0.2,
-    })
+        'amplitude': 0.2})
     run = build_closed_loop(p).run(300)
     blocks = place_poles(PAPER, closed_of(p), filter_pole)
     np.testing.assert_allclose(
-        run.column('y'), answer(blocks.reference, run.column('y_m')), atol=1e-6
-    )
+        run.column('y'), answer(blocks.reference, run.column('y_m')), atol=1e-6)
     ramp = np.arange(400.0)
     late = ramp[-1] - answer(blocks.reference, ramp)[-1]
     assert build_structure(p).delay == round(late) > 0

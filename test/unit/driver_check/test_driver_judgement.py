@@ -8,17 +8,7 @@ from math import nan
 
 import numpy as np
 import pytest
-from drivers.made_up_driver import (
-    GOOD_GRAPH,
-    PERIOD_S,
-    RATE,
-    REACH,
-    faults,
-    heard_from_driver,
-    model,
-    parameters,
-    subjects,
-)
+from drivers import made_up_driver as made
 from hypothesis import example, given
 from hypothesis import strategies as st
 
@@ -31,7 +21,7 @@ from backlash_ros.nodes.driver_graph import similar_topics
 
 
 def test_a_good_driver_fits_and_its_backlash_is_told() -> None:
-    findings = judge(GOOD_GRAPH, heard_from_driver(), Parameters(parameters()))
+    findings = judge(made.GOOD_GRAPH, made.heard_from_driver(), Parameters(made.parameters()))
     assert all_fit(findings), table(findings)
     told = findings[-1].found
     values = [float(part.split(' = ')[1].split(' ±')[0]) for part in told.split(', ')]
@@ -39,33 +29,33 @@ def test_a_good_driver_fits_and_its_backlash_is_told() -> None:
 
 
 @pytest.mark.parametrize(('graph', 'subject', 'word'), [
-    (replace(GOOD_GRAPH, publishers=2), 'publisher', 'stop all but one'),
-    (replace(GOOD_GRAPH, publishers=0), 'publisher', 'start the driver'),
-    (replace(GOOD_GRAPH, types=('std_msgs/msg/Float32',)), 'type', FLOAT64),
-    (replace(GOOD_GRAPH, listeners=0), 'listener', 'subscribe control'),
-    (replace(GOOD_GRAPH, listeners=0, near_control=('/m/control',)), 'listener', 'remap'),
-    (replace(GOOD_GRAPH, best_effort=True), 'QoS', 'reliable'),
-    (replace(GOOD_GRAPH, misfits=('control: durability',)), 'QoS', 'volatile'),
+    (replace(made.GOOD_GRAPH, publishers=2), 'publisher', 'stop all but one'),
+    (replace(made.GOOD_GRAPH, publishers=0), 'publisher', 'start the driver'),
+    (replace(made.GOOD_GRAPH, types=('std_msgs/msg/Float32',)), 'type', FLOAT64),
+    (replace(made.GOOD_GRAPH, listeners=0), 'listener', 'subscribe control'),
+    (replace(made.GOOD_GRAPH, listeners=0, near_control=('/m/control',)), 'listener', 'remap'),
+    (replace(made.GOOD_GRAPH, best_effort=True), 'QoS', 'reliable'),
+    (replace(made.GOOD_GRAPH, misfits=('control: durability',)), 'QoS', 'volatile'),
 ])
 def test_a_fault_in_the_graph_is_the_only_one_told(graph, subject, word) -> None:
-    found = faults(heard_from_driver(), graph)
-    assert subjects(found) == [subject]
+    found = made.faults(made.heard_from_driver(), graph)
+    assert made.subjects(found) == [subject]
     assert word in found[0].cure
 
 
 def test_best_effort_is_fine_where_the_controller_accepts_it() -> None:
-    graph = replace(GOOD_GRAPH, best_effort=True)
-    assert faults(heard_from_driver(), graph, io__best_effort=True) == []
+    graph = replace(made.GOOD_GRAPH, best_effort=True)
+    assert made.faults(made.heard_from_driver(), graph, io__best_effort=True) == []
 
 
 def test_nothing_is_judged_from_the_mixture_of_two_publishers() -> None:
-    findings = judge(
-        replace(GOOD_GRAPH, publishers=2), heard_from_driver(), Parameters(parameters()))
+    graph = replace(made.GOOD_GRAPH, publishers=2)
+    findings = judge(graph, made.heard_from_driver(), Parameters(made.parameters()))
     assert {f.mark for f in findings if f.subject in ('rate', 'G(z)', 'values')} == {UNKNOWN}
     assert not all_fit(findings)
 
 
-LATE_NS = int(0.7 * PERIOD_S * 1e9)
+LATE_NS = int(0.7 * made.PERIOD_S * 1e9)
 
 
 def shifted(messages: list[Message], stamp_ns: int, received_ns: int) -> list[Message]:
@@ -74,7 +64,7 @@ def shifted(messages: list[Message], stamp_ns: int, received_ns: int) -> list[Me
 
 
 def with_outputs(change: Callable[[list[Message]], list[Message]]) -> Heard:
-    heard = heard_from_driver()
+    heard = made.heard_from_driver()
     heard.outputs = change(heard.outputs)
     return heard
 
@@ -90,45 +80,44 @@ def twice(outputs: list[Message]) -> list[Message]:
 
 def bad_values(bad: float) -> Heard:
     return with_outputs(lambda sent: [
-        m._replace(value=bad) if k % 10 == 7 else m for k, m in enumerate(sent)
-    ])
+        m._replace(value=bad) if k % 10 == 7 else m for k, m in enumerate(sent)])
 
 
 def fallen_silent() -> Heard:
-    heard = heard_from_driver()
-    heard.end_ns += int(10 * PERIOD_S * 1e9)
+    heard = made.heard_from_driver()
+    heard.end_ns += int(10 * made.PERIOD_S * 1e9)
     return heard
 
 
 def late_now_and_then() -> Heard:
-    heard = heard_from_driver()
+    heard = made.heard_from_driver()
     for sent in (heard.outputs, heard.controls):
         sent[5::10] = shifted(sent[5::10], LATE_NS, LATE_NS)
     return heard
 
 
 def with_controls(value: float | None) -> Heard:
-    heard = heard_from_driver()
+    heard = made.heard_from_driver()
     heard.controls = [m._replace(value=value) for m in heard.controls if value is not None]
     return heard
 
 
 def reports_with_holes() -> Heard:
-    heard = heard_from_driver(report=True)
+    heard = made.heard_from_driver(report=True)
     del heard.applied[::4]
     return heard
 
 
-NUMERATOR, DENOMINATOR = model(0.004)
-NEAR = model(1.4 * PERIOD_S)  # another natural frequency
+NUMERATOR, DENOMINATOR = made.model(0.004)
+NEAR = made.model(1.4 * made.PERIOD_S)  # another natural frequency
 
 
 @pytest.mark.parametrize(('heard', 'changes', 'subject', 'told'), [
-    (heard_from_driver, {'sample_period': 0.05}, 'rate', ['25 Hz', 'set sample_period']),
-    (heard_from_driver, {'plant__numerator': NUMERATOR, 'plant__denominator': DENOMINATOR},
+    (made.heard_from_driver, {'sample_period': 0.05}, 'rate', ['25 Hz', 'set sample_period']),
+    (made.heard_from_driver, {'plant__numerator': NUMERATOR, 'plant__denominator': DENOMINATOR},
      'G(z)', ['discretised']),
-    (heard_from_driver, {'plant__numerator': NEAR[0], 'plant__denominator': NEAR[1],
-                         'plant__uncertainty': 0.05}, 'G(z)', ['raise plant.uncertainty']),
+    (made.heard_from_driver, {'plant__numerator': NEAR[0], 'plant__denominator': NEAR[1],
+                              'plant__uncertainty': 0.05}, 'G(z)', ['raise plant.uncertainty']),
     (lambda: with_outputs(some_lost), {}, 'lost samples', ['20 of 200 samples']),
     (lambda: with_outputs(
         lambda sent: [m._replace(number=k + 1) for k, m in enumerate(some_lost(sent))]
@@ -139,28 +128,30 @@ NEAR = model(1.4 * PERIOD_S)  # another natural frequency
     (late_now_and_then, {}, 'jitter', []),
     (lambda: with_outputs(lambda sent: [m._replace(received_ns=m.stamp_ns - 10**9) for m in sent]),
      {}, 'clock', ['synchronise']),
-    (lambda: heard_from_driver(delay=5), {}, 'reaction delay', ['set control.delay_samples: 5']),
-    (lambda: heard_from_driver(delay=2, report=True), {}, 'reaction delay',
+    (lambda: made.heard_from_driver(delay=5), {}, 'reaction delay',
+     ['set control.delay_samples: 5']),
+    (lambda: made.heard_from_driver(delay=2, report=True), {}, 'reaction delay',
      ['set control.delay_samples: 2']),
-    (lambda: heard_from_driver(report=True, limit=3.5), {'estimator__use_applied_control': False},
-     'applied_control', ['estimator.use_applied_control: true']),
-    (heard_from_driver, {'estimator__use_applied_control': True}, 'applied_control', []),
-    (lambda: heard_from_driver(sign=-1.0), {}, 'sign and units', ['m would be -1.3']),
-    (lambda: heard_from_driver(sign=180.0 / np.pi),
+    (lambda: made.heard_from_driver(report=True, limit=3.5),
+     {'estimator__use_applied_control': False}, 'applied_control',
+     ['estimator.use_applied_control: true']),
+    (made.heard_from_driver, {'estimator__use_applied_control': True}, 'applied_control', []),
+    (lambda: made.heard_from_driver(sign=-1.0), {}, 'sign and units', ['m would be -1.3']),
+    (lambda: made.heard_from_driver(sign=180.0 / np.pi),
      {'estimator__bounds__m': [0.5, 3.0], 'estimator__output_noise_std': 0.1}, 'sign and units',
      ['m would be 74']),
-    (lambda: heard_from_driver(reach=0.15), {}, 'backlash', ['wider than the gap']),
-    (lambda: heard_from_driver(rising=True), {}, 'backlash', ['both directions']),
+    (lambda: made.heard_from_driver(reach=0.15), {}, 'backlash', ['wider than the gap']),
+    (lambda: made.heard_from_driver(rising=True), {}, 'backlash', ['both directions']),
     (lambda: with_controls(None), {}, 'backlash', ['--drive']),
     (lambda: with_controls(0.0), {}, 'backlash', ['--drive']),
     (Heard, {}, 'rate', []),
-    (lambda: heard_from_driver(samples=30), {}, 'backlash', []),
+    (lambda: made.heard_from_driver(samples=30), {}, 'backlash', []),
 ])
 def test_a_fault_of_the_driver_is_the_only_one_told_with_its_figure_and_its_cure(
     heard: Callable[[], Heard], changes: dict[str, object], subject: str, told: list[str],
 ) -> None:
-    found = faults(heard(), **changes)
-    assert subjects(found) == [subject]
+    found = made.faults(heard(), **changes)
+    assert made.subjects(found) == [subject]
     assert all(words in f'{found[0].found} {found[0].cure}' for words in told)
 
 
@@ -172,47 +163,45 @@ def test_a_fault_of_the_driver_is_the_only_one_told_with_its_figure_and_its_cure
     ({'report': True, 'limit': 3.5}, {'estimator__use_applied_control': 'auto'}),
 ])
 def test_what_the_parameters_announce_is_no_fault(heard, changes):
-    assert faults(heard_from_driver(**heard), **changes) == []
+    assert made.faults(made.heard_from_driver(**heard), **changes) == []
 
 
 def test_a_timer_that_catches_up_is_not_taken_for_a_relay() -> None:
     # After every twentieth sample the timer was late and makes up for it at once.
     heard = with_outputs(lambda sent: [
-        m._replace(stamp_ns=m.stamp_ns - int(0.9 * PERIOD_S * 1e9)) if k % 20 == 19 else m
-        for k, m in enumerate(sent)
-    ])
-    found = next(f for f in faults(heard) if f.subject == 'repeated samples')
+        m._replace(stamp_ns=m.stamp_ns - int(0.9 * made.PERIOD_S * 1e9)) if k % 20 == 19 else m
+        for k, m in enumerate(sent)])
+    found = next(f for f in made.faults(heard) if f.subject == 'repeated samples')
     assert 'right after the one before' in found.found
     assert 'catching up' in found.cure
 
 
 def test_a_sensor_slower_than_the_driver_is_told() -> None:
     heard = with_outputs(lambda sent: [
-        m._replace(value=sent[k - k % 2].value) for k, m in enumerate(sent)
-    ])
-    assert 'repeated samples' in subjects(faults(heard, estimator__output_noise_std=0.1))
+        m._replace(value=sent[k - k % 2].value) for k, m in enumerate(sent)])
+    assert 'repeated samples' in made.subjects(made.faults(heard, estimator__output_noise_std=0.1))
 
 
 @pytest.mark.parametrize('use', ['auto', 'true'])
 def test_applied_control_that_leaves_samples_out_is_told(use: str) -> None:
-    found = faults(reports_with_holes(), estimator__use_applied_control=use)
-    assert subjects(found)[0] == 'applied_control'
+    found = made.faults(reports_with_holes(), estimator__use_applied_control=use)
+    assert made.subjects(found)[0] == 'applied_control'
     assert 'comes with 75% of the samples' in found[0].found
 
 
 @pytest.mark.parametrize('ratio', [0.8, 1.2])
 def test_a_model_that_is_off_by_a_fifth_fits_and_the_finding_says_how_far(ratio: float) -> None:
-    numerator, denominator = model(ratio * PERIOD_S)  # the same as another natural frequency
-    findings = judge(GOOD_GRAPH, heard_from_driver(), Parameters(parameters(
+    numerator, denominator = made.model(ratio * made.PERIOD_S)  # another natural frequency
+    findings = judge(made.GOOD_GRAPH, made.heard_from_driver(), Parameters(made.parameters(
         plant__numerator=numerator, plant__denominator=denominator)))
     assert all_fit(findings), table(findings)
     found = next(f.found for f in findings if f.subject == 'G(z)')
-    told, true = TransferFunction(numerator, denominator), TransferFunction(*model())
+    told, true = TransferFunction(numerator, denominator), TransferFunction(*made.model())
     said = [(float(error) / 100.0, float(frequency)) for error, frequency in
             re.findall(r'([\d.]+)% at ([\d.]+) Hz', found)]
     assert len(said) == 2
     for error, frequency in said:
-        z = np.exp([2j * np.pi * frequency * PERIOD_S])
+        z = np.exp([2j * np.pi * frequency * made.PERIOD_S])
         assert error == pytest.approx(abs(true.response(z) / told.response(z) - 1.0)[0], rel=0.1)
 
 
@@ -246,9 +235,10 @@ def test_drive_without_a_limit_is_refused(limits: dict[str, float], name: str) -
 
 
 def test_options_narrow_the_limits_and_never_widen_them() -> None:
-    p = Parameters(parameters())
-    assert drive_limits(p, 2.0, 10.0) == Limits(-2.0, 2.0, 10.0 * PERIOD_S)
-    assert drive_limits(p, 100.0, 1000.0) == Limits(-REACH, REACH, RATE * PERIOD_S)
+    p = Parameters(made.parameters())
+    assert drive_limits(p, 2.0, 10.0) == Limits(-2.0, 2.0, 10.0 * made.PERIOD_S)
+    widest = Limits(-made.REACH, made.REACH, made.RATE * made.PERIOD_S)
+    assert drive_limits(p, 100.0, 1000.0) == widest
 
 
 def test_similar_topics_are_named() -> None:

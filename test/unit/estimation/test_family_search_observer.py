@@ -48,11 +48,9 @@ def test_dead_time_and_another_frequency_are_among_them(omega_t: float, lag: flo
     family = PlantFamily(two_poles(omega_t), 0.2)
     true = altered_plant(two_poles(omega_t), 0.9, 1.0, lag)
     z = np.exp(1j * np.linspace(0.05, 3.0, 60))
-
     def apart(xi: np.ndarray) -> np.ndarray:
         off = family.model_at(xi.tolist()).response(z) - true.response(z)
         return np.concatenate([off.real, off.imag])
-
     begins = [[(lag + by) / family._scales[0][0], 0.0, 0.0, 0.0] for by in (-0.2, 0.1, 0.2)]
     assert min(abs(least_squares(apart, begin).fun).max() for begin in begins) < 1e-6
 

@@ -79,8 +79,7 @@ def test_the_file_holds_it_and_forgets_one_that_is_not_there() -> None:
     assert parameters['plant.denominator'] == found_so.model.denominator
     assert 'actuator' in commented_yaml(parameters, found_so, 'a test')
     again = identified_parameters(replace(found_so, actuator=None), {
-        **given, 'actuator.numerator': (1.0,), 'actuator.denominator': (1.0, 0.0),
-    })
+        **given, 'actuator.numerator': (1.0,), 'actuator.denominator': (1.0, 0.0)})
     assert again['actuator.numerator'] == ()
 
 

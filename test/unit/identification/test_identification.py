@@ -25,8 +25,7 @@ QUICK = Options(orders=(1, 2), delays=(0, 1))
 
 def motion(count: int, reach: float = 3.0, rate: float = 40.0) -> Array:
     return np.array(list(islice(
-        strokes(-reach, reach, rate, PERIOD_S, count * PERIOD_S, 0.0), count
-    )))
+        strokes(-reach, reach, rate, PERIOD_S, count * PERIOD_S, 0.0), count)))
 
 
 def record(

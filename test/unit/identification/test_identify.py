@@ -21,8 +21,7 @@ QUICK = ('--order', '1-2', '--delay', '0-1')
 def write_csv(path: Path, v: np.ndarray, y: np.ndarray) -> Path:
     rows = [
         f'{k * PERIOD_S!r},{float(a)!r},{"" if np.isnan(b) else repr(float(b))}'
-        for k, (a, b) in enumerate(zip(v, y, strict=True))
-    ]
+        for k, (a, b) in enumerate(zip(v, y, strict=True))]
     path.write_text('t,v,y\n' + '\n'.join(rows) + '\n')
     return path
 
@@ -37,8 +36,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
     config = folder / 'mine.yaml'
     config.write_text(
         '/**: {ros__parameters: {control: {min: -4.0, max: 4.0, rate_max: 40.0},'
-        ' on_stop: zero, backlash: {m: 7.0}, input_disturbance: 2.0}}'
-    )
+        ' on_stop: zero, backlash: {m: 7.0}, input_disturbance: 2.0}}')
     v, y = record()
     y[::50] = np.nan
     source = write_csv(folder / 'mine.csv', v, y)
@@ -50,8 +48,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_all_files_are_written_with_the_numbers_of_the_actuator(result: Path) -> None:
     assert {path.name for path in result.iterdir()} == {
         'identified.yaml', 'identified.json', 'identify.html', 'estimates.json', 'record.csv',
-        'held_out.png', 'loop.png', 'residual.png', 'bode.png',
-    }
+        'held_out.png', 'loop.png', 'residual.png', 'bode.png'}
     found = json.loads((result / 'identified.json').read_text())
     assert found['usable'] is True
     assert (found['reasons'], found['m']) == ([], 0.5)
@@ -70,7 +67,6 @@ def test_the_file_is_a_complete_configuration(result: Path) -> None:
     assert parameters.plant.denominator == pytest.approx(numbers['denominator'])
     assert parameters.control.delay_samples == numbers['delay_samples']
     assert parameters.plant.uncertainty == numbers['uncertainty']
-    # What was given stays, but for the plant that is simulated.
     assert (parameters.control.rate_max, parameters.on_stop) == (40.0, 'zero')
     assert (parameters.backlash.m, parameters.input_disturbance) == (0.5, 0.0)
     build_controller(parameters)
@@ -139,8 +135,7 @@ def test_an_axis_gets_a_file_of_its_own(tmp_path, capsys):
     config.write_text(
         "/bringup: {ros__parameters: {axes: ['x', 'z']}}\n"
         '/**: {ros__parameters: {control: {min: -4.0, max: 4.0, rate_max: 40.0}}}\n'
-        '/z/**: {ros__parameters: {control: {max: 5.0}}}\n'
-    )
+        '/z/**: {ros__parameters: {control: {max: 5.0}}}\n')
     source = write_csv(tmp_path / 'a.csv', *record(800))
     given = [str(source), *QUICK, '--config', str(config), '--out', str(tmp_path / 'out')]
     assert main(given) == 2

@@ -8,13 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from backlash_ros.core.identification.not_play import (
-    BESIDE_V,
-    LinearFamily,
-    Observed,
-    best_other,
-    what_it_is,
-)
+from backlash_ros.core.identification import not_play
 
 Array = NDArray[np.float64]
 
@@ -53,7 +47,7 @@ def behind(u: Array, plant: str, noise: float = NOISE) -> Array:
     return np.asarray(y + noise * np.random.default_rng(5).standard_normal(len(u)))
 
 
-def observed(v: Array, y: Array, gap: float = GAP, noise: float = NOISE) -> Observed:
+def observed(v: Array, y: Array, gap: float = GAP, noise: float = NOISE) -> not_play.Observed:
     p = play(v, gap)
     columns = [np.ones(len(v)), K[:len(v)] * 1e-3, np.cumsum(p - p.mean())]
     columns += [np.append(np.full(k, p[0]), p[:len(p) - k]) for k in range(12)]
@@ -62,7 +56,7 @@ def observed(v: Array, y: Array, gap: float = GAP, noise: float = NOISE) -> Obse
     whole = np.column_stack(columns)
     known = np.isfinite(y)
     solution = np.linalg.lstsq(whole[known], y[known], rcond=None)[0]
-    return Observed(v, y, p, whole @ solution, noise, gap)
+    return not_play.Observed(v, y, p, whole @ solution, noise, gap)
 
 
 OTHERS: dict[str, tuple[Callable[[Array], Array], str]] = {
@@ -77,8 +71,8 @@ OTHERS: dict[str, tuple[Callable[[Array], Array], str]] = {
 }
 
 
-def named(o: Observed) -> str:
-    answer = what_it_is(o)
+def named(o: not_play.Observed) -> str:
+    answer = not_play.what_it_is(o)
     assert answer.cure
     return answer.reason
 
@@ -112,10 +106,9 @@ def test_a_stick_band_behind_each_turn_is_named_with_its_jump() -> None:
 ])
 def test_a_play_is_nothing_else(plant: str, gap: float, noise: float) -> None:
     o = observed(V, behind(play(V, gap), plant, noise), gap, noise)
-    assert what_it_is(o) is None
-    # Not even where the residual asks for it.
-    assert not any(test(o) for test, _ in BESIDE_V)
-    assert best_other(o) is None
+    assert not_play.what_it_is(o) is None
+    assert not any(test(o) for test, _ in not_play.BESIDE_V)
+    assert not_play.best_other(o) is None
 
 
 @pytest.mark.parametrize('noise', [0.05, 0.3])
@@ -123,7 +116,7 @@ def test_noise_that_is_not_white_is_no_nonlinearity(noise: float) -> None:
     wander = lfilter([noise], [1.0, -0.95], np.random.default_rng(8).standard_normal(COUNT))
     o = observed(V, behind(play(V, GAP), 'lag') + wander)
     assert o.unexplained
-    assert what_it_is(o) is None
+    assert not_play.what_it_is(o) is None
 
 
 @pytest.mark.parametrize('side', ['both', 'one'])
@@ -138,7 +131,7 @@ def test_a_load_that_is_pushed_at_rest_is_named() -> None:
     v = 2.0 * np.round(np.sin(0.01 * K))
     push = 0.3 * ((K % 70) > 45)
     assert 'while v is at rest' in named(observed(v, behind(play(v, GAP), 'lag') + push))
-    assert what_it_is(observed(v, behind(play(v, GAP), 'lag'))) is None
+    assert not_play.what_it_is(observed(v, behind(play(v, GAP), 'lag'))) is None
 
 
 def test_a_y_that_does_not_return_with_v_is_named() -> None:
@@ -149,7 +142,7 @@ def test_a_y_that_does_not_return_with_v_is_named() -> None:
 
 @pytest.mark.parametrize('plant', ['gain', 'lag', 'two lags'])
 def test_a_gap_that_grows_is_told_from_part_to_part(plant: str) -> None:
-    family = LinearFamily(V, behind(play(V, np.linspace(0.5, 0.8, COUNT)), plant))
+    family = not_play.LinearFamily(V, behind(play(V, np.linspace(0.5, 0.8, COUNT)), plant))
     ramp = np.linspace(0.0, 1.0, COUNT)
     gaps, found = family.changing(GAP, np.array([1.0 - ramp, ramp]))
     assert gaps == pytest.approx([0.5, 0.8], abs=0.02)
@@ -158,7 +151,7 @@ def test_a_gap_that_grows_is_told_from_part_to_part(plant: str) -> None:
 
 def test_a_gap_on_a_part_of_the_way_is_told_though_none_fits_best() -> None:
     width = 0.2 * (1.0 + np.cos(1.3 * V))
-    family = LinearFamily(V, behind(play(V, width), 'lag'))
+    family = not_play.LinearFamily(V, behind(play(V, width), 'lag'))
     gaps, _ = family.changing(0.0, np.array([
         np.interp(V, np.linspace(V.min(), V.max(), 5), row) for row in np.eye(5)]))
     assert (gaps.argmax(), gaps[2]) == (2, pytest.approx(0.4, abs=0.1))

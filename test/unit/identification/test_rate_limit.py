@@ -14,7 +14,6 @@ PERIOD_S, GAP = 0.02, 0.3
 
 
 def goals(rng: np.random.Generator) -> np.ndarray:
-    """Goals from -10 to 10 that hold for a second, shape (3000,)."""
     return np.repeat(rng.uniform(-10.0, 10.0, 60), 50)
 
 

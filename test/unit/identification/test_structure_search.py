@@ -8,40 +8,27 @@ import pytest
 from scipy.signal import lfilter
 
 from backlash_ros.core.estimation.posterior import WindowFit
+from backlash_ros.core.identification import model as models
+from backlash_ros.core.identification import structure_search as search
 from backlash_ros.core.identification.identification import identify
-from backlash_ros.core.identification.model import (
-    Model,
-    Samples,
-    Structure,
-    by_model,
-    covariance_of,
-    first_model,
-    fitted,
-)
 from backlash_ros.core.identification.motion import strokes
-from backlash_ros.core.identification.structure_search import (
-    Compared,
-    Options,
-    cancelled_poles,
-    gives_way,
-    selected,
-)
 from backlash_ros.core.plant.backlash import play
 
-SAMPLES = Samples(np.zeros(2), np.full(2, np.nan), 1, 2, 0.0)
+SAMPLES = models.Samples(np.zeros(2), np.full(2, np.nan), 1, 2, 0.0)
 
 
-def model_of(integrator: bool, poles: list[complex], zeros: list[complex]) -> Model:
-    structure = Structure(len(poles) + integrator, 0, integrator)
+def model_of(integrator: bool, poles: list[complex], zeros: list[complex]) -> models.Model:
+    structure = models.Structure(len(poles) + integrator, 0, integrator)
     a = np.real(np.poly(poles))[1:] if poles else np.empty(0)
     b = np.zeros(structure.numerator_taps)
     b[len(b) - 1 - len(zeros):] = np.real(np.poly(zeros))
     theta = np.concatenate([[1.0, 0.0, 1.0], structure.xi(b, a)])
-    return Model(structure, SAMPLES.problem(structure), WindowFit(np.zeros(1), 0.0, theta, 1.0))
+    fit = WindowFit(np.zeros(1), 0.0, theta, 1.0)
+    return models.Model(structure, SAMPLES.problem(structure), fit)
 
 
-def compared(model: Model, held_out: float, criterion: float) -> Compared:
-    return Compared(model.structure, held_out, model, model, criterion)
+def compared(model: models.Model, held_out: float, criterion: float) -> search.Compared:
+    return search.Compared(model.structure, held_out, model, model, criterion)
 
 
 PLAIN = compared(model_of(False, [0.6 + 0.4j, 0.6 - 0.4j], [-0.8]), 1.2, -20.0)
@@ -57,24 +44,23 @@ NEITHER = compared(model_of(True, [0.98, 0.6 + 0.4j, 0.6 - 0.4j], [-0.8, 1.0, 0.
     (True, [], [], []), (False, [0.9, 0.5], [], []),
 ])
 def test_a_pole_with_a_zero_on_it_is_cancelled(integrator, poles, zeros, cancelled):
-    assert cancelled_poles(model_of(integrator, poles, zeros)) == pytest.approx(cancelled)
+    assert search.cancelled_poles(model_of(integrator, poles, zeros)) == pytest.approx(cancelled)
 
 
 def test_a_cancelled_pole_gives_way_however_well_it_predicts() -> None:
-    assert selected([PLAIN, NO_INTEGRATOR, NEITHER]) is PLAIN
+    assert search.selected([PLAIN, NO_INTEGRATOR, NEITHER]) is PLAIN
     # The structure without the slow pole is not needed either, nor the one without the integrator.
     slow = compared(model_of(False, [0.98, 0.6 + 0.4j, 0.6 - 0.4j], [-0.8, 0.98]), 1.05, -35.0)
-    assert selected([PLAIN, NO_INTEGRATOR, slow, NEITHER]) is PLAIN
+    assert search.selected([PLAIN, NO_INTEGRATOR, slow, NEITHER]) is PLAIN
 
 
 def test_it_gives_way_to_nothing_else_than_the_structure_without_it() -> None:
-    assert gives_way(NO_INTEGRATOR.whole, [PLAIN])
-    assert not gives_way(PLAIN.whole, [PLAIN])
-    # Neither of two orders less nor of another delay.
-    assert not gives_way(NEITHER.whole, [PLAIN, NEITHER])
-    assert selected([PLAIN, NEITHER]) is NEITHER
+    assert search.gives_way(NO_INTEGRATOR.whole, [PLAIN])
+    assert not search.gives_way(PLAIN.whole, [PLAIN])
+    assert not search.gives_way(NEITHER.whole, [PLAIN, NEITHER])
+    assert search.selected([PLAIN, NEITHER]) is NEITHER
     later = PLAIN._replace(structure=replace(PLAIN.structure, delay=1))
-    assert not gives_way(NO_INTEGRATOR.whole, [later, NO_INTEGRATOR])
+    assert not search.gives_way(NO_INTEGRATOR.whole, [later, NO_INTEGRATOR])
 
 
 def test_a_gain_and_a_delay_have_no_poles_and_can_be_controlled() -> None:
@@ -82,13 +68,13 @@ def test_a_gain_and_a_delay_have_no_poles_and_can_be_controlled() -> None:
     v = np.array(list(islice(strokes(-2.0, 2.0, 8.0, 0.02, 20.0, 0.0), 1000)))
     u = play(v, 0.4, 0.2) - 0.1
     y = np.append(np.zeros(3), 1.7 * u[:-3]) + 0.002 * rng.standard_normal(len(v))
-    found = identify(v, y, 0.02, Options((0, 1), (1, 2, 3)))
+    found = identify(v, y, 0.02, search.Options((0, 1), (1, 2, 3)))
     assert found.usable
     assert (found.model.delay, found.model.denominator) == (2, (1.0, 0.0))
     assert found.model.numerator == pytest.approx((1.7,), abs=0.01)
     assert found.gap == pytest.approx(0.4, abs=3.0 * found.std['gap'])
     # A delay that may be longer than all that were compared is no narrow gap.
-    edge = identify(v, y, 0.02, Options((0, 1), (0, 1)))
+    edge = identify(v, y, 0.02, search.Options((0, 1), (0, 1)))
     assert edge.std['gap'] > 0.9 * np.abs(np.diff(v)).mean()
     assert any('longest that was compared' in text for text in edge.remarks)
 
@@ -98,7 +84,7 @@ def test_a_delay_beyond_those_that_are_compared_first_is_found() -> None:
     v = np.array(list(islice(strokes(-2.0, 2.0, 8.0, 0.02, 20.0, 0.0), 1000)))
     u = play(v, 0.4, 0.2) - 0.1
     y = lfilter([0.0, 0.3], [1.0, -0.7], np.append(np.zeros(12), u[:-12]))
-    found = identify(v, y + 0.002 * rng.standard_normal(len(v)), 0.02, Options((1, 2)))
+    found = identify(v, y + 0.002 * rng.standard_normal(len(v)), 0.02, search.Options((1, 2)))
     assert found.model.delay == 12
     assert found.gap == pytest.approx(0.4, abs=4.0 * found.std['gap'])
     assert found.std['gap'] < 0.01
@@ -107,9 +93,9 @@ def test_a_delay_beyond_those_that_are_compared_first_is_found() -> None:
 def std_of_gap(noise: np.ndarray) -> tuple[float, float]:
     v = np.sin(0.05 * np.arange(len(noise)))
     y = lfilter([0.0, 0.3], [1.0, -0.7], play(v, 0.3, 0.1)) + noise
-    samples, structure = Samples(v, y, 1, len(v), 0.0), Structure(1, 0, False)
-    found = fitted(samples, structure, first_model(samples, structure, 0.25, 0.1).fit)
-    matrix = covariance_of(found.problem, found.fit)
+    samples, structure = models.Samples(v, y, 1, len(v), 0.0), models.Structure(1, 0, False)
+    found = models.fitted(samples, structure, models.first_model(samples, structure, 0.25, 0.1).fit)
+    matrix = models.covariance_of(found.problem, found.fit)
     return matrix[2, 2] ** 0.5, found.fit.cov[2, 2] ** 0.5
 
 
@@ -123,18 +109,17 @@ def test_noise_that_lasts_leaves_a_wider_gap_than_white_noise() -> None:
 
 
 def test_models_that_fit_alike_tell_a_deviation_and_others_none() -> None:
-    assert by_model(1.0, [(1.2, -3.0), (1.3, 4.0), (9.0, 4.1)]) == pytest.approx(0.2)
-    assert by_model(1.0, []) == 0.0
+    assert models.by_model(1.0, [(1.2, -3.0), (1.3, 4.0), (9.0, 4.1)]) == pytest.approx(0.2)
+    assert models.by_model(1.0, []) == 0.0
 
 
 def test_a_fit_that_leaves_more_than_y_itself_is_taken_only_where_all_do() -> None:
     v = np.zeros(50)
-    samples = Samples(v, np.sin(np.arange(50.0)), 1, 50, 0.0)
-    structures = [Structure(0, 0, False), Structure(1, 0, False)]
-    # A gain of 0 for an offset of 0 and of 9.
-    still, off = (Model(one, samples.problem(one), WindowFit(
+    samples = models.Samples(v, np.sin(np.arange(50.0)), 1, 50, 0.0)
+    structures = [models.Structure(0, 0, False), models.Structure(1, 0, False)]
+    still, off = (models.Model(one, samples.problem(one), WindowFit(
         np.zeros(1), 0.0, np.concatenate([[1.0, offset, 1.0], one.xi(np.ones(1), np.zeros(
             one.free_poles))]), 1.0)) for one, offset in zip(structures, (0.0, 9.0), strict=True))
     good, bad = compared(still, 1.0, -10.0), compared(off, 0.1, 50.0)
-    assert selected([good, bad]) is good
-    assert selected([bad]) is bad
+    assert search.selected([good, bad]) is good
+    assert search.selected([bad]) is bad

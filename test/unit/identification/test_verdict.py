@@ -31,8 +31,7 @@ def test_a_gap_is_known_though_gain_and_middle_are_not() -> None:
     assert first.startswith('the gap is 0.6 ± 0.01; the gain of G at rest is known not at all')
     assert second == (
         'G is known to 30 %: good enough to start the controller with plant.uncertainty as in '
-        'identified.yaml, which learns the rest'
-    )
+        'identified.yaml, which learns the rest')
     assert found.reasons == ()
     assert verdict(gap_std=0.12).lines[0] == 'the gap is 0.6 ± 0.12, known to 20 % only'
 
@@ -83,7 +82,6 @@ def test_no_backlash_is_said_with_a_bound() -> None:
 
 
 def test_many_small_plays_that_look_like_a_wider_one_are_named() -> None:
-    # Of a single sine, with a lag.
     sine = 2.0 * np.sin(0.03 * np.arange(len(V)))
     plays = sum(0.2 * play(sine, width) for width in np.linspace(0.0, 1.2, 5))
     o = observed(sine, behind(plays, 'lag'), 2.0)

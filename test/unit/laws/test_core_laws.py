@@ -61,8 +61,7 @@ TRUTH = {'m': 1.3, 'c_r': 3.0, 'c_l': -3.0}
 def four_blocks(**changes: object) -> Parameters:
     named = {name.replace('__', '.'): value for name, value in changes.items()}
     return Parameters({
-        'structure': 'pole_placement', 'estimator.law': 'gradient', 'amplitude': 0.2, **named,
-    })
+        'structure': 'pole_placement', 'estimator.law': 'gradient', 'amplitude': 0.2, **named})
 
 
 @pytest.mark.parametrize('amplitude', [0.05, 0.2, 1.0])
@@ -114,8 +113,7 @@ def test_it_is_the_least_squares_solution_of_random_walk_and_noise(noise_std: fl
     walk = np.eye(samples) - np.eye(samples, k=-1)
     batch, *_ = np.linalg.lstsq(
         np.vstack([response / noise_std, walk]), np.append(y / noise_std, np.zeros(samples)),
-        rcond=None,
-    )
+        rcond=None)
     recursion = InputReconstruction(PAPER, noise_std, lag)
     for value in y:
         recursion.update(float(value))

@@ -63,11 +63,10 @@ def test_estimates_of_another_plant_or_law_are_refused(file, name, value):
 
 
 @pytest.mark.parametrize(('std', 'reason'), [
-    (0.01, ''), (None, ''), (0.0, 'holds constants that were given'),
+    (0.01, ''), (nan, ''), (0.0, 'holds constants that were given'),
 ])
 def test_constants_that_were_learned_serve_the_law_that_learns_none(file, std, reason):
-    deviation = nan if std is None else std
-    learned = replace(LEARNED, std_m=deviation, std_c_r=deviation, std_c_l=deviation)
+    learned = replace(LEARNED, std_m=std, std_c_r=std, std_c_l=std)
     save_estimate(file, learned, parameters(file))
     p = parameters(file, **{'estimator.law': 'fixed'})
     if reason:
@@ -102,7 +101,6 @@ def test_values_that_cannot_be_are_refused(file, part, value, reason):
 def test_a_first_guess_is_not_worth_saving() -> None:
     assert worth_saving(LEARNED)
     assert not worth_saving(Estimate(1.0, 1.0, -1.0, 0.2))
-    # Laws without deviations.
     assert worth_saving(Estimate(1.0, 1.0, -1.0, 0.2, status=Status.TRACKING))
     assert worth_saving(replace(LEARNED, status=Status.INCONSISTENT))
 
@@ -118,8 +116,7 @@ def test_whoever_builds_a_controller_begins_with_what_was_known(file: Path) -> N
     loop.reset()
     assert loop.estimate.m == p.estimator.initial.m
     assert summarise(run, p)['began_with'] == {
-        'm': 1.25, 'c_r': 2.5, 'c_l': -3.5, 'f': 0.2, 'from': p.estimates.file,
-    }
+        'm': 1.25, 'c_r': 2.5, 'c_l': -3.5, 'f': 0.2, 'from': p.estimates.file}
     plain = Parameters()
     began = summarise(build_closed_loop(plain).run(30), plain)['began_with']
     assert (began['c_r'], began['from']) == (0.5, 'estimator.initial')

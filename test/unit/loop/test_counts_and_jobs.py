@@ -60,8 +60,7 @@ def lines_of(findings: list[tuple[float, Finding]]) -> list[tuple[Level, str]]:
 def test_a_change_of_level_is_one_line_and_one_when_all_is_well_again() -> None:
     findings = [(float(t), WRONG if 5 <= t < 20 else WELL) for t in range(40)]
     assert lines_of(findings) == [
-        (Level.ERROR, 'the model is wrong'), (Level.OK, 'well again: learned'),
-    ]
+        (Level.ERROR, 'the model is wrong'), (Level.OK, 'well again: learned')]
 
 
 def test_what_comes_and_goes_is_told_once_per_while() -> None:

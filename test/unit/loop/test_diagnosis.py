@@ -136,8 +136,7 @@ def test_every_cause_of_the_table_is_tried_here() -> None:
     tried = {first(replace(WELL, **changes)).kind for changes, *_ in CASES}
     unfit = {
         'output type', 'output reliability', 'output qos', 'reference type',
-        'reference reliability', 'reference qos', 'control type', 'control qos',
-    }
+        'reference reliability', 'reference qos', 'control type', 'control qos'}
     assert tried == {kind for kind, *_ in causes_of(WELL)} | unfit
 
 
@@ -152,7 +151,6 @@ def test_estimates_of_before_that_hold_are_not_said_to_move() -> None:
     acquiring = replace(WELL, status=Status.ACQUIRING)
     assert first(acquiring).kind == 'acquiring'
     assert first(replace(acquiring, report=LawReport(unconfirmed=True))).kind == 'known'
-    # It is confirmed where the status says so, or asked for.
     assert first(replace(WELL, report=LawReport(unconfirmed=True))) == LEARNED
     assert first(replace(acquiring, report=LawReport(unconfirmed=True), adapting=False)).kind == \
         'adaptation off'
@@ -173,7 +171,6 @@ def test_a_contradiction_is_named_by_what_the_fit_has_found(changes, text):
     found = first(replace(INCONSISTENT, **changes))
     assert found == Finding(Level.ERROR, 'model', text)
     assert len(text) <= LONGEST_TEXT
-    # An estimate that holds is not doubted.
     assert findings_of(replace(WELL, **changes)) == [LEARNED]
 
 
@@ -269,8 +266,7 @@ def test_long_names_of_topics_and_nodes_leave_the_cure_in_place() -> None:
     names = {
         'output': TopicFigures('/robot/left_arm/shoulder_pan/joint_states', 'JointState', (node,)),
         'control': TopicFigures('forward_command_controller/commands', 'Float64MultiArray', (
-            node,)),
-    }
+            node,))}
     late = first(replace(WELL, late=60, **names))
     assert late.text == \
         '10 % of …/commands came too late: relieve the machine or lengthen sample_period'

@@ -18,8 +18,7 @@ OMEGA = 2.0 * pi  # a period of one second
 
 def signal(waveform: str, samples: tuple[float, ...] = (), **values: object) -> ReferenceSignal:
     return ReferenceSignal(
-        Parameters({'waveform': waveform, 'amplitude': 1.0, 'frequency': OMEGA, **values}), samples
-    )
+        Parameters({'waveform': waveform, 'amplitude': 1.0, 'frequency': OMEGA, **values}), samples)
 
 
 @given(t=st.floats(0.0, 100.0), amplitude=st.floats(0.0, 10.0), bias=st.floats(-10.0, 10.0),
@@ -43,11 +42,9 @@ def test_shape_of(waveform: str, t: float, value: float) -> None:
 def test_chirp_sweeps_its_frequency_and_starts_again() -> None:
     chirp = signal('chirp', frequency=20.0, frequency_start=2.0, sweep_time=10.0)
     step = 1e-4
-
     def frequency(t: float) -> float:
         slope = (chirp(t + step) - chirp(t - step)) / (2.0 * step)
         return abs(slope) / (1.0 - chirp(t) ** 2) ** 0.5
-
     for t, omega in ((0.1, 2.18), (5.0, 11.0), (9.9, 19.82)):
         assert frequency(t) == pytest.approx(omega, rel=0.01)
     assert chirp(13.3) == pytest.approx(chirp(3.3))
@@ -60,11 +57,9 @@ def test_file_plays_sample_k_at_the_kth_period_whatever_the_rounding(k, period):
 
 
 @pytest.mark.parametrize(('text', 'complaint'), [
-    ('', 'header t,y_m'),
-    ('t,y_m\n0,1,2\n', 'line 2 must hold t,y_m'),
+    ('', 'header t,y_m'), ('t,y_m\n0,1,2\n', 'line 2 must hold t,y_m'),
     ('t,y_m\n0,1\n0.02,2\n', 'line 3 must hold t=0.01'),
-    ('t,y_m\n0,nan\n', 'finite y_m'),
-    ('t,y_m\n', 'at least one sample'),
+    ('t,y_m\n0,nan\n', 'finite y_m'), ('t,y_m\n', 'at least one sample'),
 ])
 def test_a_reference_file_is_refused_with_its_line(tmp_path, text, complaint):
     file = tmp_path / 'reference.csv'
@@ -127,7 +122,6 @@ def test_reference_of_the_next_sample_leaves_half_a_period_after_each_output() -
     arrivals = times(100)
     sent = messages_of(arrivals, 100 * PERIOD_S)[2:]
     for at, sample in sent:
-        # y(sample - 1) came half a period before.
         assert at - arrivals[sample - 1] == pytest.approx(0.5 * PERIOD_S, abs=2 * STEP_S)
     assert [sample for _, sample in sent] == list(range(sent[0][1], sent[0][1] + len(sent)))
 

@@ -24,8 +24,7 @@ def stamps_of(gaps: list[int], delays: list[float]) -> list[int]:
         samples.append(samples[-1] + 1 + gap)
     return [
         START_NS + int((sample + delay) * PERIOD_NS)
-        for sample, delay in zip(samples, delays, strict=False)
-    ]
+        for sample, delay in zip(samples, delays, strict=False)]
 
 
 @given(gaps, delays, st.booleans())
@@ -33,8 +32,7 @@ def test_time_stamps_tell_every_missing_sample_though_the_numbers_have_no_gap(ga
     counter = SampleCounter(PERIOD_S)
     arrivals = [
         counter.count(stamp, 1 + i if known else UNNUMBERED)
-        for i, stamp in enumerate(stamps_of(gaps, delays))
-    ]
+        for i, stamp in enumerate(stamps_of(gaps, delays))]
     assert [arrival.missing for arrival in arrivals] == [0, *gaps]
     assert [arrival.unsent for arrival in arrivals] == [0, *(gaps if known else [0] * len(gaps))]
     assert counter.index == sum(gaps) + len(gaps)
@@ -98,7 +96,6 @@ def test_the_command_next_to_the_one_in_use_may_have_acted_instead() -> None:
     # What leaves just after a sample may have come before it by the clock of another machine.
     v, instead = commands.over(1, START_NS + int(2.8 * PERIOD_NS), START_NS + 2.8 * PERIOD_NS)
     assert (v, instead) == ([1.0], [2.0])
-    # One that left more than a period before has arrived.
     v, instead = commands.over(1, START_NS + 4 * PERIOD_NS, START_NS + 4.0 * PERIOD_NS)
     assert v == [2.0]
     assert isnan(instead[0])
@@ -142,8 +139,7 @@ def test_reports_are_used_from_the_first_on_until_they_stop() -> None:
         [False] * 3 + [True] * (n + 10) + [False] + [True] * 5 + [False] * 2 * n + [True] * n)
     assert used == [
         *[False] * 3, *[True] * (n + 10), False, *[True] * 5, *[False] * 2 * n,
-        *[False] * (n - 1), True,
-    ]
+        *[False] * (n - 1), True]
     # What is missing counts while reports are used, and not from a driver that has none.
     assert unreported == 1 + n - 1
 
@@ -164,7 +160,6 @@ def test_the_origin_of_reports_is_found_whether_the_motor_lags_or_is_limited(lag
         command = sin(0.1 * k)
         position = lag * position + (1.0 - lag) * min(command, most)
         origin.changed_by(round((position + beyond) / 1e-3) * 1e-3, command)
-    # A motor that is limited has no other origin.
     assert origin.value == pytest.approx(beyond, abs=1e-3)
 
 
@@ -224,8 +219,7 @@ def test_second_sender_is_refused_while_the_first_one_sends(first: int, phase: f
     for k in range(100):
         arrivals = [
             (due + k * PERIOD_NS, 41 + k, True),
-            (due + int((k + phase) * PERIOD_NS), 10**7 + first + k, False),
-        ]
+            (due + int((k + phase) * PERIOD_NS), 10**7 + first + k, False)]
         for stamp, number, own in sorted(arrivals):
             accepted += counter.count(stamp, number).is_sample and not own
     assert (accepted, counter.index) == (0, 139)
@@ -272,8 +266,7 @@ def test_a_sender_that_is_slow_or_pauses_has_lost_nothing(stamps, numbered):
     counter = SampleCounter(PERIOD_S)
     for k, stamp in enumerate(stamps):
         arrival = counter.count(
-            START_NS + round(stamp * PERIOD_S * 1e9), k + 1 if numbered else UNNUMBERED
-        )
+            START_NS + round(stamp * PERIOD_S * 1e9), k + 1 if numbered else UNNUMBERED)
         assert arrival == Arrival(is_sample=True)
         # Commands are judged by when the sample was due: that follows the sender.
         assert -0.7 < (counter.due_ns - START_NS) / (PERIOD_S * 1e9) - stamp < 1e-3
@@ -311,8 +304,7 @@ def told(
     """v of the intervals, where the messages of v are numbered from 0; times in sample periods."""
     v = command_history.v_of_intervals(
         np.array(index), (np.array(outputs) * 1e6).astype(np.int64),
-        (np.array(stamps) * 1e6).astype(np.int64), np.arange(float(len(stamps))), reported,
-    )
+        (np.array(stamps) * 1e6).astype(np.int64), np.arange(float(len(stamps))), reported)
     return np.nan_to_num(v, nan=-1.0).tolist()
 
 

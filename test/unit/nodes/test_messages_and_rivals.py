@@ -14,14 +14,7 @@ from backlash_ros import topics
 from backlash_ros.middleware import PROFILE, prefer_loopback
 from backlash_ros.nodes.control.publishing import watched_values
 from backlash_ros.nodes.control.rivals import ENDPOINT, SINCE, Rival, Rivals
-from backlash_ros.nodes.runtime.messages import (
-    SILENT_S,
-    JointMessage,
-    JointReader,
-    joint_message,
-    message_with,
-    number_of,
-)
+from backlash_ros.nodes.runtime import messages
 from backlash_ros.nodes.runtime.parameters import unused
 
 HERE = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
@@ -50,27 +43,28 @@ def test_a_profile_of_the_user_stays(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 @pytest.mark.parametrize('number', [0.0, -1.5, 1e-300, 12.345678901234567, inf, -inf, nan])
 def test_a_number_goes_out_and_comes_in_as_a_float64(number: float) -> None:
-    assert repr(deserialize_message(message_with(number), Float64).data) == repr(number)
-    assert repr(number_of(serialize_message(Float64(data=number)))) == repr(number)
+    assert repr(deserialize_message(messages.message_with(number), Float64).data) == repr(number)
+    assert repr(messages.number_of(serialize_message(Float64(data=number)))) == repr(number)
 
 
 def test_a_sender_whose_highest_byte_comes_first_is_understood() -> None:
-    assert number_of(b'\x00\x00\x00\x00' + struct.pack('>d', -7.25)) == -7.25
+    assert messages.number_of(b'\x00\x00\x00\x00' + struct.pack('>d', -7.25)) == -7.25
 
 
 JOINTS = (
-    JointMessage(5_000_000_006, ('a', 'wrist_1', 'elbow'), (1.0, inf, -2.5), (), (0.1, 0.2, 0.3)),
-    JointMessage(7, ('a', 'wrist_1', 'elbow'), (-1.0, 2.0), (3.0,)),
-    JointMessage(8, ('a', 'wrist_1', 'eight'), (4.0,)),
-    JointMessage(9, ('one',), (), (0.5,)),
-    JointMessage(10),
+    messages.JointMessage(
+        5_000_000_006, ('a', 'wrist_1', 'elbow'), (1.0, inf, -2.5), (), (0.1, 0.2, 0.3)),
+    messages.JointMessage(7, ('a', 'wrist_1', 'elbow'), (-1.0, 2.0), (3.0,)),
+    messages.JointMessage(8, ('a', 'wrist_1', 'eight'), (4.0,)),
+    messages.JointMessage(9, ('one',), (), (0.5,)),
+    messages.JointMessage(10),
 )
 
 
 def test_joints_go_out_as_a_joint_state_and_come_in_as_one() -> None:
-    reader = JointReader()
+    reader = messages.JointReader()
     for content in JOINTS:
-        state = deserialize_message(joint_message(content), JointState)
+        state = deserialize_message(messages.joint_message(content), JointState)
         assert state.header.stamp.sec * 10**9 + state.header.stamp.nanosec == content.stamp_ns
         for field in content._fields[1:]:
             assert tuple(getattr(state, field)) == getattr(content, field)
@@ -81,7 +75,8 @@ def test_joints_go_out_as_a_joint_state_and_come_in_as_one() -> None:
 
 def test_joints_of_a_sender_whose_highest_byte_comes_first_are_understood() -> None:
     message = struct.pack('>4siII2s2xII2s2xIdI', bytes(4), 1, 2, 2, b'f', 1, 2, b'j', 1, 0.5, 0)
-    assert JointReader().read(message + bytes(4)) == JointMessage(1_000_000_002, ('j',), (0.5,))
+    content = messages.JointMessage(1_000_000_002, ('j',), (0.5,))
+    assert messages.JointReader().read(message + bytes(4)) == content
 
 
 @pytest.mark.parametrize(('sections', 'full_name'), [
@@ -150,8 +145,8 @@ def test_a_controller_that_says_nothing_any_more_is_gone_though_discovery_still_
     rivals = rivals_of()
     rivals.among({'x': '/other'}, 9.0)
     rivals.hear(claim('x', 50), 10.0)
-    assert rivals.among({'x': '/other'}, 10.0 + 0.9 * SILENT_S) == (Rival('/other', True),)
-    assert rivals.among({'x': '/other'}, 10.0 + 1.1 * SILENT_S) == ()
+    assert rivals.among({'x': '/other'}, 10.0 + 0.9 * messages.SILENT_S) == (Rival('/other', True),)
+    assert rivals.among({'x': '/other'}, 10.0 + 1.1 * messages.SILENT_S) == ()
 
 
 def test_who_is_inactive_has_no_rivals_and_is_none() -> None:

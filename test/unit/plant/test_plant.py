@@ -13,13 +13,7 @@ from records import resonance
 from scipy.signal import lfilter
 from strategies import eighths, output_of, paper_example, plants, signals, usual_plays
 
-from backlash_ros.core.assembly import (
-    build_controller,
-    build_model,
-    build_plant,
-    build_reference,
-    build_true_model,
-)
+from backlash_ros.core import assembly
 from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.parameters import ParameterError, Parameters
 from backlash_ros.core.plant.actuator import Actuator
@@ -49,8 +43,7 @@ def test_clamp_equals_the_three_printed_cases(m, c_l, gap, u, signal):
     expected = Fraction(u)
     for v in signal:
         expected, region = as_printed(
-            expected, Fraction(v), Fraction(m), Fraction(c_l + gap), Fraction(c_l)
-        )
+            expected, Fraction(v), Fraction(m), Fraction(c_l + gap), Fraction(c_l))
         assert (backlash.step(v), backlash.region) == (expected, region)
 
 
@@ -62,8 +55,7 @@ values = st.floats(-10.0, 10.0)
 def test_stepping_the_turns_alone_leaves_nothing_out(v, gaps, before):
     stepped = [
         list(islice(accumulate(v, lambda p, x, g=gap: clamp(p, x, x + g), initial=before), 1, None))
-        for gap in gaps
-    ]
+        for gap in gaps]
     assert play(np.array(v), gaps[0], before).tolist() == stepped[0]
     assert play(np.array(v), np.array(gaps), np.full(len(gaps), before)).tolist() == stepped
 
@@ -93,8 +85,7 @@ def test_y_is_g_of_the_backlash_output_plus_the_disturbance(model, play, control
     u = np.array([backlash.step(v) for v in control])
     expected = output_of(model, u + disturbance)
     np.testing.assert_allclose(
-        outputs(simulated, control), expected, atol=1e-9 * (1.0 + np.abs(expected).max())
-    )
+        outputs(simulated, control), expected, atol=1e-9 * (1.0 + np.abs(expected).max()))
 
 
 @given(control=signals(), quantum=st.floats(0.001, 1.0))
@@ -109,8 +100,7 @@ def test_quantised_output_is_the_nearest_multiple(control: list[float], quantum:
 def test_wear_moves_the_backlash_with_time_and_the_jump_comes_at_its_time() -> None:
     simulated = plant(**{
         'backlash.rate': (0.1, 1.0, -2.0), 'backlash.jump_time': 0.5,
-        'backlash.jump': (0.0, 1.0, 0.0), 'sample_period': 0.1,
-    })
+        'backlash.jump': (0.0, 1.0, 0.0), 'sample_period': 0.1})
     seen = []
     for _ in range(11):
         simulated.step(0.0)
@@ -127,7 +117,7 @@ def test_wear_moves_the_backlash_with_time_and_the_jump_comes_at_its_time() -> N
 ], ids=['jump to m < 0', 'jump to c_l = c_r', 'm falls below 0 after 1.3 s'])
 def test_wear_never_ends_in_an_invalid_backlash(changes: dict[str, list[float]]) -> None:
     with pytest.raises(ParameterError) as refusal:
-        outputs(build_plant(paper_example(**changes)), [0.0] * 400)
+        outputs(assembly.build_plant(paper_example(**changes)), [0.0] * 400)
     assert refusal.value.name.startswith('backlash.')
 
 
@@ -173,19 +163,18 @@ def test_plant_that_no_continuous_one_has_is_refused_with_its_pole() -> None:
 def test_given_plant_takes_the_place_of_the_known_one_in_the_simulation_alone() -> None:
     known = Parameters({'control.delay_samples': 1})
     p = known.replaced({
-        'truth.numerator': [0.3], 'truth.denominator': [1.0, -0.5, 0.06], 'truth.delay_samples': 3,
-    })
-    assert_equal(
-        build_true_model(p), TransferFunction([0.3], [1.0, -0.5, 0.06, 0.0, 0.0, 0.0]), 0.0
-    )
-    assert_equal(build_model(p), build_model(known), 0.0)
+        'truth.numerator': [0.3], 'truth.denominator': [1.0, -0.5, 0.06], 'truth.delay_samples': 3})
+    true = TransferFunction([0.3], [1.0, -0.5, 0.06, 0.0, 0.0, 0.0])
+    assert_equal(assembly.build_true_model(p), true, 0.0)
+    assert_equal(assembly.build_model(p), assembly.build_model(known), 0.0)
     denominator = p.replaced({'truth.numerator': [], 'truth.denominator': [1.0, -2.8, 2.7, -0.9]})
-    assert build_true_model(denominator).numerator.max() == max(p.plant.numerator)
+    assert assembly.build_true_model(denominator).numerator.max() == max(p.plant.numerator)
 
 
 def test_bad_truth_is_named_as_such() -> None:
+    p = Parameters({'truth.numerator': [1.0, 2.0], 'truth.denominator': [1.0, 0.5]})
     with pytest.raises(ParameterError, match=r'truth\.numerator=.* of truth\.denominator'):
-        build_plant(Parameters({'truth.numerator': [1.0, 2.0], 'truth.denominator': [1.0, 0.5]}))
+        assembly.build_plant(p)
 
 
 LAG = TransferFunction((0.05, 0.05), (1.0, -1.6, 0.65), 'actuator')  # gain 2
@@ -198,10 +187,9 @@ PARAMETERS = {
 
 
 def response_to(commands: list[float]) -> np.ndarray:
-    plant = build_plant(Parameters({
+    plant = assembly.build_plant(Parameters({
         **PARAMETERS, 'plant.numerator': (0.3, 0.2), 'plant.denominator': (1.0, -0.6, 0.1),
-        'backlash.m': 1.0, 'backlash.c_r': 1.0, 'backlash.c_l': -0.5,
-    }))
+        'backlash.m': 1.0, 'backlash.c_r': 1.0, 'backlash.c_l': -0.5}))
     y = []
     for command in commands:
         y.append(plant.measure())
@@ -214,12 +202,10 @@ def test_a_command_beyond_its_crossing_moves_y_and_within_does_not() -> None:
     assert (c_r, c_l) == pytest.approx((0.8, -0.45))
     gain = 2.0 * MODEL.numerator.sum() / MODEL.denominator.sum()
     top = c_r + 1.0
-
     def rests_at(lowest: float) -> float:
         ways = [(0.0, top), (top, top), (top, lowest), (lowest, lowest)]
         commands = [np.linspace(a, b, 400) for a, b in ways]
         return float(response_to(np.concatenate(commands).tolist())[-1])
-
     assert rests_at(top) == pytest.approx(gain, rel=1e-3)
     across = top - (c_r - c_l)
     assert rests_at(across + 0.01) == pytest.approx(gain, rel=1e-3)
@@ -234,7 +220,7 @@ def test_a_command_beyond_its_crossing_moves_y_and_within_does_not() -> None:
 ])
 def test_an_actuator_that_is_none_is_refused_by_name(changes, text):
     with pytest.raises(ParameterError, match=text):
-        build_controller(Parameters({**PARAMETERS, **changes}))
+        assembly.build_controller(Parameters({**PARAMETERS, **changes}))
 
 
 # A position loop with a lag of 6 samples, whose wind-up is a third of the gap behind it.
@@ -259,7 +245,8 @@ def follow(
     known: Parameters, reported: Callable[[int], bool] = lambda k: True,
 ) -> tuple[float, Estimate]:
     """RMS of y against the delayed y_m over the second half, and the last estimate."""
-    controller, plant, y_m = build_controller(known), build_plant(TRUE), build_reference(TRUE)
+    controller, plant = assembly.build_controller(known), assembly.build_plant(TRUE)
+    y_m = assembly.build_reference(TRUE)
     applied: tuple[float, ...] = ()
     rows = []
     for k in range(SAMPLES):
@@ -294,7 +281,8 @@ def test_lost_outputs_are_stepped_over() -> None:
 
 
 def test_a_reading_that_is_none_does_not_move_the_motor() -> None:
-    controller, plant, y_m = build_controller(TRUE), build_plant(TRUE), build_reference(TRUE)
+    controller, plant = assembly.build_controller(TRUE), assembly.build_plant(TRUE)
+    y_m = assembly.build_reference(TRUE)
     moves, v = [], 0.0
     for k in range(SAMPLES):
         y = plant.measure() + (50.0 if k in (800, 801) else 0.0)
@@ -302,5 +290,4 @@ def test_a_reading_that_is_none_does_not_move_the_motor() -> None:
         controller.refine()
         plant.step(v)
         moves.append(abs(v - before))
-    # By more than the motion moves it, but for the gap that it crosses.
     assert max(moves[795:810]) < max(moves[500:795]) + TRUE.backlash.c_r - TRUE.backlash.c_l

@@ -48,22 +48,18 @@ def of_every_page(pattern: re.Pattern[str]) -> Iterator[tuple[Path, str]]:
 
 
 def shell_commands() -> list[list[str]]:
-    """The words of each command in blocks of shell and text and in the lines of all pages."""
     scripts = '|'.join(console_scripts())
     command = re.compile(
-        rf'(make [a-z]|(.venv/bin/)?(python3? (?!-m)\S+|({scripts}) [-\w])|ros2 run backlash_ros)'
-    )
+        rf'(make [a-z]|(.venv/bin/)?(python3? (?!-m)\S+|({scripts}) [-\w])|ros2 run backlash_ros)')
     found = [
         (language, line)
         for page in PAGES for language, text in BLOCK.findall(page.read_text())
         if language in ('bash', 'sh', 'text')
-        for line in text.replace('\\\n', ' ').splitlines()
-    ]
+        for line in text.replace('\\\n', ' ').splitlines()]
     found += [('text', code) for _, code in of_every_page(CODE)]
     lines = [
         line for language, line in found if language != 'text'
-        or (command.match(line) and not re.search(r'NAME|FILE|HOST|\.\.\.|[^ -~]', line))
-    ]
+        or (command.match(line) and not re.search(r'NAME|FILE|HOST|\.\.\.|[^ -~]', line))]
     words = {line: shlex.split(line, comments=True) for line in lines}
     return [line for line in words.values() if line]
 
@@ -108,8 +104,7 @@ def test_parameters_that_pages_name_exist() -> None:
     named = {
         code for _, code in of_every_page(CODE)
         if DOTTED.fullmatch(code) and code.split('.')[0] in GROUPS
-        and code.split('.')[-1] not in FILE_ENDINGS
-    }
+        and code.split('.')[-1] not in FILE_ENDINGS}
     groups = {name.rsplit('.', 1)[0] for name in BY_NAME if '.' in name}
     assert named & set(BY_NAME)
     assert named <= set(BY_NAME) | groups
@@ -140,7 +135,6 @@ def test_command_exists_and_takes_its_arguments(words: list[str]) -> None:
 
 
 def check_tool(program: str, arguments: list[str]) -> None:
-    """Let the tool itself parse its options, and the core build what they describe."""
     if program in ('monitor', 'live'):
         return
     if program in ('controller', 'plant', 'reference', 'recorder'):
@@ -149,21 +143,18 @@ def check_tool(program: str, arguments: list[str]) -> None:
         return
     tool: dict[str, Any] = {
         'compare': compare, 'report': report, 'identify': identify, 'replay': replay,
-        'simulate': simulate,
-    }
+        'simulate': simulate}
     options = (
         bringup.parse_options(arguments) if program == 'bringup' else
         parse_options(arguments) if program == 'check_driver' else
-        tool[program].make_parser().parse_args(arguments)
-    )
+        tool[program].make_parser().parse_args(arguments))
     # Another command, or the user, writes these files.
     elsewhere = ('identified.yaml', 'limits.yaml', 'my_actuator.yaml')
     if options.config is not None and Path(options.config).name in elsewhere:
         return
     if program in ('simulate', 'bringup'):
         build_controller(effective_parameters(
-            options.config, options.settings, options.seed, options.axis
-        ))
+            options.config, options.settings, options.seed, options.axis))
     else:
         assert options.config is None or (ROOT / options.config).is_file()
     for sweep in getattr(options, 'sweep', []):
@@ -175,8 +166,7 @@ def test_commands_that_need_no_ros_run(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(os, 'sched_getaffinity', lambda pid: {0}, raising=False)
     mains: dict[str, Callable[[list[str]], int]] = {
-        'simulate': simulate.main, 'report': report.main, 'replay': replay.main,
-    }
+        'simulate': simulate.main, 'report': report.main, 'replay': replay.main}
     done = []
     # `replay` needs a run, of which a sweep of simulations leaves none.
     for program, *arguments in sorted(
@@ -195,14 +185,12 @@ def test_commands_that_need_no_ros_run(tmp_path: Path, monkeypatch: pytest.Monke
 def blocks(*languages: str) -> list[str]:
     return [
         text for page in PAGES for language, text in BLOCK.findall(page.read_text())
-        if language in languages
-    ]
+        if language in languages]
 
 
 def python_snippets() -> list[str]:
     return blocks('python') + [
-        snippet for text in blocks('bash', 'sh', 'ini') for snippet in PYTHON_C.findall(text)
-    ]
+        snippet for text in blocks('bash', 'sh', 'ini') for snippet in PYTHON_C.findall(text)]
 
 
 @pytest.mark.parametrize('text', python_snippets())
@@ -221,8 +209,7 @@ def test_files_that_pages_show_are_valid() -> None:
     assert started
     assert set(started) <= console_scripts()
     assert not {language for page in PAGES for language, _ in BLOCK.findall(page.read_text())} - {
-        'bash', 'sh', 'ini', 'python', 'text', 'xml', 'yaml',
-    }
+        'bash', 'sh', 'ini', 'python', 'text', 'xml', 'yaml'}
 
 
 def test_readme_names_every_executable_and_topic() -> None:

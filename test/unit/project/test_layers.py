@@ -12,9 +12,7 @@ from places import ROOT
 PACKAGE = 'backlash_ros'
 SHARED = {
     PACKAGE,
-    *(f'{PACKAGE}.{name}' for name in (
-        'atomic_file', 'middleware', 'options', 'topics',
-    )),
+    *(f'{PACKAGE}.{name}' for name in ('atomic_file', 'middleware', 'options', 'topics')),
 }
 LAYERS = ('core', 'bags', 'nodes', 'tools')
 # Each room of the core imports from those before it only; likewise the parts of estimation.
@@ -34,7 +32,6 @@ SOURCES = sorted((ROOT / PACKAGE).rglob('*.py'))
 
 
 def imported_modules(source: str, module: str, is_package: bool) -> Iterator[str]:
-    """Yield the absolute names of all modules that `source`, the text of `module`, imports."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -48,8 +45,7 @@ def imported_modules(source: str, module: str, is_package: bool) -> Iterator[str
             yield from (
                 [f'{base}.{alias.name}' for alias in node.names]
                 if base in (PACKAGE, *(f'{PACKAGE}.{layer}' for layer in LAYERS))
-                else [base]
-            )
+                else [base])
 
 
 def is_ros(module: str) -> bool:
@@ -62,7 +58,6 @@ def within(module: str, layer: str) -> bool:
 
 
 def is_upwards(module: str, imported: str, folder: str, order: tuple[str, ...]) -> bool:
-    """Return whether an import between two parts of a folder is against their order."""
     parts = [name.removeprefix(f'{folder}.').split('.')[0] for name in (module, imported)]
     if not (module.startswith(f'{folder}.') and imported.startswith(f'{folder}.')):
         return False
@@ -70,7 +65,6 @@ def is_upwards(module: str, imported: str, folder: str, order: tuple[str, ...]) 
 
 
 def is_allowed(module: str, imported: str) -> bool:
-    """Return whether the layers let `module` import `imported`."""
     top = imported.split('.')[0]
     if within(module, 'core'):
         known = top in sys.stdlib_module_names | NUMERIC or within(imported, 'core')
@@ -78,8 +72,7 @@ def is_allowed(module: str, imported: str) -> bool:
     if within(module, 'bags'):
         return (
             top in sys.stdlib_module_names | {'mcap', 'rosbags'} or imported in SHARED
-            or within(imported, 'core') or within(imported, 'bags')
-        )
+            or within(imported, 'core') or within(imported, 'bags'))
     if within(module, 'nodes'):
         return not within(imported, 'tools')
     if within(module, 'tools'):
@@ -114,8 +107,7 @@ def test_rooms_of_the_core_are_stacked(folder: str, order: tuple[str, ...]) -> N
         for imported in imported_modules(path.read_text(), module, is_package):
             if module.startswith(f'{folder}.') and imported.startswith(f'{folder}.'):
                 seen.update(
-                    name.removeprefix(f'{folder}.').split('.')[0] for name in (module, imported)
-                )
+                    name.removeprefix(f'{folder}.').split('.')[0] for name in (module, imported))
                 if is_upwards(module, imported, folder, order):
                     upwards.append(f'{module} imports {imported}')
     assert upwards == []
@@ -133,8 +125,7 @@ def test_no_two_files_need_each_other_and_none_takes_private_names() -> None:
             f'{module}: {alias.name}'
             for node in ast.walk(ast.parse(source)) if isinstance(node, ast.ImportFrom)
             for alias in node.names
-            if (node.module or '').startswith(PACKAGE) and alias.name.startswith('_')
-        ]
+            if (node.module or '').startswith(PACKAGE) and alias.name.startswith('_')]
     assert private == []
     order = TopologicalSorter(imports).static_order()
     assert len(list(order)) >= len(SOURCES)  # raises CycleError, which names the files

@@ -24,8 +24,7 @@ def test_launch_file_names_executables_that_are_installed() -> None:
     tree = ast.parse((ROOT / 'launch' / 'backlash.launch.py').read_text())
     launched = {
         ast.literal_eval(call.args[0]) for call in ast.walk(tree)
-        if isinstance(call, ast.Call) and ast.unparse(call.func) == 'node'
-    }
+        if isinstance(call, ast.Call) and ast.unparse(call.func) == 'node'}
     assert launched == {'controller', 'reference', 'recorder', 'plant'}
 
 
@@ -35,12 +34,10 @@ def test_package_xml_names_every_imported_ros_package() -> None:
     imported = {
         module
         for path in ROOT.glob('backlash_ros/**/*.py')
-        for module in re.findall(r'^ *(?:from|import) (\w+)', path.read_text(), re.MULTILINE)
-    }
+        for module in re.findall(r'^ *(?:from|import) (\w+)', path.read_text(), re.MULTILINE)}
     ros = {
         name for name in imported
-        if name.startswith(ROS_PREFIXES) or name.endswith(ROS_SUFFIXES)
-    }
+        if name.startswith(ROS_PREFIXES) or name.endswith(ROS_SUFFIXES)}
     assert 'rclpy' in ros
     assert ros <= declared
 
@@ -50,8 +47,7 @@ def test_package_xml_setup_and_module_name_one_version() -> None:
     tree = ast.parse((ROOT / 'setup.py').read_text())
     (setup,) = (
         ast.literal_eval(node.value) for node in ast.walk(tree)
-        if isinstance(node, ast.keyword) and node.arg == 'version'
-    )
+        if isinstance(node, ast.keyword) and node.arg == 'version')
     assert package_xml == setup == backlash_ros.__version__
 
 

@@ -82,8 +82,7 @@ def test_joint_states_and_commands_are_y_and_v(tmp_path: Path, name: str) -> Non
 def test_of_several_joints_one_is_asked_for_and_may_be_named(tmp_path: Path) -> None:
     path = bag(tmp_path / 'bag', {
         'joint_states': (JOINTS, STAMPS, TWO),
-        'commands': (NUMBERS, LATER, [[3.0, v] for v in V]),
-    })
+        'commands': (NUMBERS, LATER, [[3.0, v] for v in V])})
     with pytest.raises(InputError, match='choose a joint with --axis') as told:
         read_record(path)
     assert 'commands[0], commands[1], joint_states/elbow, joint_states/shoulder' in str(told.value)
@@ -99,14 +98,11 @@ def test_one_bad_stamp_is_dropped_and_counted(tmp_path: Path, stamp: int, row: i
     stamps = STAMPS.copy()
     stamps[row] = stamp
     record = read_record(bag(tmp_path / 'bag', {
-        topics.PLANT_OUTPUT: (NUMBER, stamps, Y), topics.CONTROL: (NUMBER, LATER, V),
-    }))
+        topics.PLANT_OUTPUT: (NUMBER, stamps, Y), topics.CONTROL: (NUMBER, LATER, V)}))
     assert '1 message with a stamp far off left out' in record.timing
     first = int(row == 0)
     assert np.isnan(record.y).tolist() == [
-        k == row for k in range(first, COUNT - (row == COUNT - 1))
-    ]
-    # After the last y, the newest command acts.
+        k == row for k in range(first, COUNT - (row == COUNT - 1))]
     assert record.v[:-1].tolist() == V[first:len(record.v) + first - 1].tolist()
 
 
@@ -116,8 +112,7 @@ def test_dropped_commands_are_said_and_the_motor_is_not_judged_by_them(tmp_path:
         topics.PLANT_OUTPUT: (NUMBER, STAMPS, Y),
         topics.CONTROL: (NUMBER, np.delete(LATER, range(5, 150, 10)),
                                np.delete(V, range(5, 150, 10)).tolist()),
-        topics.APPLIED_CONTROL: (NUMBER, STAMPS - 100_000, motor),
-    }))
+        topics.APPLIED_CONTROL: (NUMBER, STAMPS - 100_000, motor)}))
     assert record.notes == ('15 messages of control are missing: the one before is taken for them',)
     assert record.commands is None
     assert record.v[:-1].tolist() == V[:-1].tolist()

@@ -234,8 +234,7 @@ def test_parquet_is_read_where_pyarrow_is_installed(tmp_path, monkeypatch):
     for t in (T, stamps):
         parquet.write_table(
             pyarrow.table({'time': t, 'setpoint': V, 'actual': Y, 'note': ['x'] * COUNT}),
-            tmp_path / 'a.parquet',
-        )
+            tmp_path / 'a.parquet')
         record = read_record(tmp_path / 'a.parquet')
         assert record.sample_period == pytest.approx(0.02, rel=1e-6)
         assert record.y.tolist() == Y.tolist()

@@ -48,8 +48,7 @@ def test_even_rows_stay_as_they_are() -> None:
 
 @pytest.mark.parametrize('jitter', [0.02, 0.08, 0.2, 0.5])
 def test_readings_are_moved_from_their_true_instants_onto_the_grid(jitter: float) -> None:
-    rng = np.random.default_rng(1)
-    t = np.sort(even() + jitter * PERIOD_S * (rng.random(COUNT) - 0.5) * 2.0)
+    t = np.sort(even() + jitter * PERIOD_S * np.random.default_rng(1).uniform(-1.0, 1.0, COUNT))
     record = log(t)
     assert 'v and y are taken at them' in record.timing
     assert record.sample_period == pytest.approx(PERIOD_S, rel=2e-3)
@@ -112,8 +111,7 @@ def test_a_longer_period_than_that_of_the_stamps_is_kept_with_the_time() -> None
 
 def test_equal_stamps_of_a_coarse_clock_keep_the_mean_period() -> None:
     for rows in (2, 3, 8):
-        stamps = even()[rows * (np.arange(COUNT) // rows)]
-        record = log(even(), stamps=stamps)
+        record = log(even(), stamps=even()[rows * (np.arange(COUNT) // rows)])
         assert record.sample_period == pytest.approx(PERIOD_S, rel=1e-6)
         assert record.lost == 0
         assert off(record) < 1.1e-3
@@ -197,42 +195,33 @@ def test_stamps_that_are_none_are_left_out_and_counted(bad: float, rows: list[in
     kept = np.delete(np.arange(COUNT), rows)
     assert len(record.v) == kept[-1] - kept[0] + 1
     assert record.lost == len(record.v) - len(kept)
-    begin = PERIOD_S * kept[0]
-    assert off(record, begin) < 1.1e-3
+    assert off(record, PERIOD_S * kept[0]) < 1.1e-3
 
 
 def test_the_longest_run_of_a_log_with_several_is_used() -> None:
-    t = np.concatenate([even(300), even(700), even(200)])
-    record = log(t)
+    record = log(np.concatenate([even(300), even(700), even(200)]))
     assert len(record.v) == 700
     assert 'begins anew 2 times' in record.timing
 
 
 def test_a_short_gap_is_missing_samples_and_a_long_one_ends_the_record() -> None:
-    t = np.concatenate([even(500), even(500) + 5.1])
-    record = log(t)
-    assert len(record.v) == 1010
-    assert record.lost == 10
-    # v holds over it.
-    assert set(record.v[499:510]) == {command(t[499:500])[0]}
-    t = np.concatenate([even(500), even(700) + 3e5])
-    record = log(t)
+    record = log(np.concatenate([even(500), even(500) + 5.1]))
+    assert (len(record.v), record.lost) == (1010, 10)
+    assert set(record.v[499:510]) == {command(even()[499:500])[0]}
+    record = log(np.concatenate([even(500), even(700) + 3e5]))
     assert len(record.v) == 700
     assert 'long gap' in record.timing
 
 
 def test_rows_that_repeat_the_one_before_count_once() -> None:
-    t = np.repeat(even(), 2)
-    record = log(t, noise=0.0)
+    record = log(np.repeat(even(), 2), noise=0.0)
     assert record.v.tolist() == command(even()).tolist()
     assert '1200 rows that repeat' in record.timing
 
 
 def test_where_moving_y_would_show_the_grid_is_finer() -> None:
-    rng = np.random.default_rng(1)
-    t = np.sort(even() + 0.4 * PERIOD_S * (rng.random(COUNT) - 0.5) * 2.0)
-    y = np.sin(90.0 * t)
-    record = record_of(t, 1.1 * np.sin(90.0 * t), y)
+    t = np.sort(even() + 0.4 * PERIOD_S * np.random.default_rng(1).uniform(-1.0, 1.0, COUNT))
+    record = record_of(t, 1.1 * np.sin(90.0 * t), np.sin(90.0 * t))
     assert record.sample_period <= 0.51 * PERIOD_S
     assert np.count_nonzero(np.isfinite(record.y)) > 0.97 * COUNT
 
@@ -303,7 +292,6 @@ def test_reads_that_failed_are_lost(value: float, share: float) -> None:
     y[wrong] = value
     found, told = readings.failed(y)
     assert told == value
-    # Three in a row are rare enough.
     assert found.tolist() == wrong.tolist()
     assert np.isnan(record_of(T, MOTION, y).y[wrong]).all()
 
@@ -353,8 +341,7 @@ def test_what_v_does_and_what_is_no_turn_is_kept(v: Array, y: Array) -> None:
 @pytest.mark.parametrize(('y', 'step'), [
     (MOTION, 0.0), (np.round(MOTION, 1), 0.1), (0.25 * np.round(200.0 * MOTION) + 8e8, 0.25),
     # an encoder, in a file of few digits
-    (np.round(np.round(MOTION * 64.0) / 64.0, 3), 1.0 / 64.0),
-    (np.full(9, 3.0), 0.0),
+    (np.round(np.round(MOTION * 64.0) / 64.0, 3), 1.0 / 64.0), (np.full(9, 3.0), 0.0),
 ])
 def test_the_step_of_a_quantised_y_is_told(y: Array, step: float) -> None:
     assert readings.quantum(y) == pytest.approx(step, rel=1e-3)

@@ -8,19 +8,9 @@ from dataclasses import dataclass
 from math import nan
 from pathlib import Path
 
+import made_bags
 import numpy as np
 import pytest
-from made_bags import (
-    FLOAT,
-    LATENCY_S,
-    MULTI_ARRAY,
-    PARAMETERS,
-    believed,
-    float_message,
-    rows_of,
-    write_bag,
-    write_messages,
-)
 from matplotlib.figure import Figure
 from rosbags.rosbag2 import StoragePlugin
 
@@ -40,14 +30,14 @@ from backlash_ros.tools.runs.summary import compare_laws, followed_reference, mo
 
 @pytest.fixture(scope='module')
 def run() -> RunRecord:
-    return build_closed_loop(PARAMETERS).run(120)
+    return build_closed_loop(made_bags.PARAMETERS).run(120)
 
 
 @pytest.fixture(scope='module')
 def page(run: RunRecord, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp('report')
-    write_bag(out / 'bag', run, lost=frozenset({60}))
-    write_config(PARAMETERS, out / 'parameters.yaml')
+    made_bags.write_bag(out / 'bag', run, lost=frozenset({60}))
+    write_config(made_bags.PARAMETERS, out / 'parameters.yaml')
     report.write_report(read_run(out), out)
     return out / 'report.html'
 
@@ -57,7 +47,6 @@ def png_references(html: str) -> list[bytes]:
 
 
 def test_page_needs_nothing_from_elsewhere(page: Path) -> None:
-    # What the pictures consist of may look like anything.
     html = re.sub('base64,[^"]+', 'base64,', page.read_text(encoding='utf-8'))
     sources = re.findall(r'(?:src|href|url|srcset|action)\s*[=(]\s*["\']?([^"\'>\s)]+)', html)
     assert sources
@@ -71,13 +60,13 @@ def test_page_holds_the_pictures_that_lie_beside_it(page: Path) -> None:
     assert sorted(png_references(html)) == sorted(beside.values())
     assert set(beside) == {
         'parameter_errors.png', 'estimates.png', 'control_error.png', 'laws.png',
-        'hysteresis.png', 'output.png', 'input.png',
-    }
+        'hysteresis.png', 'output.png', 'input.png'}
 
 
-@pytest.mark.parametrize('models', [{}, {5: believed([1.0, -0.5])}])
+@pytest.mark.parametrize('models', [{}, {5: made_bags.believed([1.0, -0.5])}])
 def test_bag_without_a_whole_model_is_read_all_the_same(run, tmp_path, models):
-    found = read_bag(write_bag(tmp_path / 'bag', run, models=models), run.sample_period).record
+    bag = made_bags.write_bag(tmp_path / 'bag', run, models=models)
+    found = read_bag(bag, run.sample_period).record
     assert found.samples == run.samples
     assert found.learned is None
     assert summarise(found, None)['model'] is None
@@ -85,8 +74,9 @@ def test_bag_without_a_whole_model_is_read_all_the_same(run, tmp_path, models):
 
 @pytest.mark.parametrize('storage', [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
 def test_bag_gives_back_the_run(tmp_path: Path, storage: StoragePlugin) -> None:
-    worn = build_closed_loop(PARAMETERS.replaced({'backlash.rate': [0.1, 0.2, -0.3]})).run(40)
-    found = read_bag(write_bag(tmp_path / 'bag', worn, storage), worn.sample_period)
+    p = made_bags.PARAMETERS.replaced({'backlash.rate': [0.1, 0.2, -0.3]})
+    worn = build_closed_loop(p).run(40)
+    found = read_bag(made_bags.write_bag(tmp_path / 'bag', worn, storage), worn.sample_period)
     expected = worn.rows.copy()
     # The last v was never applied: no u, and the truth of the sample before.
     expected[-1, COLUMNS.index('u')] = nan
@@ -94,11 +84,11 @@ def test_bag_gives_back_the_run(tmp_path: Path, storage: StoragePlugin) -> None:
     np.testing.assert_array_equal(found.record.rows, expected)
     assert found.record.has_truth
     assert (found.record.lost_samples, found.notes) == (0, ())
-    np.testing.assert_array_equal(found.latency_s, LATENCY_S)
+    np.testing.assert_array_equal(found.latency_s, made_bags.LATENCY_S)
 
 
 def test_sample_without_its_estimates_is_counted(run: RunRecord, tmp_path: Path) -> None:
-    bag = write_bag(tmp_path / 'bag', run, unpaired=frozenset({50, 119}))
+    bag = made_bags.write_bag(tmp_path / 'bag', run, unpaired=frozenset({50, 119}))
     found = read_bag(bag, run.sample_period)
     assert (found.record.lost_samples, found.record.samples) == (0, 118)
     assert found.notes[0].startswith('2 samples were left out')
@@ -107,12 +97,11 @@ def test_sample_without_its_estimates_is_counted(run: RunRecord, tmp_path: Path)
 @pytest.mark.usefixtures('undrawn')
 def test_report_without_truth_shows_estimates_and_innovation(run, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    write_bag(tmp_path / 'bag', run, truth=False)
+    made_bags.write_bag(tmp_path / 'bag', run, truth=False)
     assert report.main(['bag']) == 0
     out = tmp_path / 'results' / 'latest'
     assert {path.name for path in out.glob('*.png')} == {
-        'estimates.png', 'innovation.png', 'hysteresis.png', 'output.png', 'input.png',
-    }
+        'estimates.png', 'innovation.png', 'hysteresis.png', 'output.png', 'input.png'}
     html = (out / 'report.html').read_text(encoding='utf-8')
     assert 'no truth was recorded' in html
     assert 'no parameters were given' in html
@@ -121,20 +110,19 @@ def test_report_without_truth_shows_estimates_and_innovation(run, tmp_path, monk
 
 
 def broken_bag(path: Path, run: RunRecord) -> None:
-    write_bag(path, run)
+    made_bags.write_bag(path, run)
     [data] = path.glob('*.mcap')
     data.write_bytes(data.read_bytes()[:300])
 
 
 def other_bag(path: Path, run: RunRecord) -> None:
-    write_messages(path, [(1, 'chatter', FLOAT, float_message(0.0))])
+    made_bags.write_messages(path, [(1, 'chatter', made_bags.FLOAT, made_bags.float_message(0.0))])
 
 
 @pytest.mark.parametrize(('make', 'message'), [
-    (None, 'does not exist'),
-    (broken_bag, 'is damaged, and nothing of it can be read'),
+    (None, 'does not exist'), (broken_bag, 'is damaged, and nothing of it can be read'),
     (other_bag, 'holds no message of controller/signals; its topics are /chatter'),
-    (lambda path, run: write_bag(path, RunRecord(run.rows[:0], run.sample_period)),
+    (lambda path, run: made_bags.write_bag(path, RunRecord(run.rows[:0], run.sample_period)),
      'holds no message of controller/signals'),
     (lambda path, run: path.mkdir(), 'holds no bag, no record.npz and no samples.csv'),
     (lambda path, run: path.touch(), 'holds no table: give rows of numbers'),
@@ -160,14 +148,15 @@ def test_many_lost_samples_are_named_unless_they_were_asked_for(
     run, tmp_path, capsys, lost, meant, said,
 ):
     of_losses = RunRecord(run.rows, run.sample_period, lost)
-    report.write_report(Run(of_losses, PARAMETERS.replaced({'output_loss': meant})), tmp_path)
+    p = made_bags.PARAMETERS.replaced({'output_loss': meant})
+    report.write_report(Run(of_losses, p), tmp_path)
     assert capsys.readouterr().err.count(f'{lost} of {120 + lost} samples were lost') == said
 
 
 @pytest.mark.usefixtures('undrawn')
 def test_run_of_one_sample_has_a_report(tmp_path: Path) -> None:
-    run = build_closed_loop(PARAMETERS).run(1)
-    assert report.write_report(Run(run, PARAMETERS), tmp_path)['samples'] == 1
+    run = build_closed_loop(made_bags.PARAMETERS).run(1)
+    assert report.write_report(Run(run, made_bags.PARAMETERS), tmp_path)['samples'] == 1
     assert (tmp_path / 'report.html').is_file()
 
 
@@ -191,7 +180,7 @@ def test_moving_rms_is_that_of_the_newest_samples() -> None:
 
 
 def test_law_that_breaks_off_does_not_take_the_report_with_it(run: RunRecord) -> None:
-    other = PARAMETERS.replaced({'waveform': 'file', 'file': 'gone.csv'})
+    other = made_bags.PARAMETERS.replaced({'waveform': 'file', 'file': 'gone.csv'})
     curves, notes = compare_laws(run, other)
     assert [len(curve.t) for curve in curves] == [run.samples]
     assert notes
@@ -201,20 +190,19 @@ def test_law_that_breaks_off_does_not_take_the_report_with_it(run: RunRecord) ->
 
 @pytest.mark.parametrize('storage', StoragePlugin)
 def test_a_lone_file_of_a_bag_is_a_bag(tmp_path, run, storage):
-    bag = write_bag(tmp_path / 'bag', run, storage)
+    bag = made_bags.write_bag(tmp_path / 'bag', run, storage)
     (file,) = (file for file in bag.iterdir() if file.suffix in ('.mcap', '.db3'))
     lone = Path(shutil.copy(file, tmp_path / f'sent{file.suffix}'))
-    write_config(PARAMETERS, tmp_path / 'parameters.yaml')
+    write_config(made_bags.PARAMETERS, tmp_path / 'parameters.yaml')
     found = read_run(lone)
     assert found.notes == ()
-    assert found.parameters == PARAMETERS
+    assert found.parameters == made_bags.PARAMETERS
     np.testing.assert_array_equal(found.record.column('y'), run.column('y'))
     np.testing.assert_array_equal(read_record(lone).y, run.column('y'))
     assert replay.main([str(lone), '--sweep', 'estimator.law=lms,fixed',
                         '--out', str(tmp_path / 'out')]) == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == [
-        'bag', 'out', 'parameters.yaml', lone.name,
-    ]
+        'bag', 'out', 'parameters.yaml', lone.name]
 
 
 @pytest.mark.usefixtures('undrawn')
@@ -225,8 +213,8 @@ def test_a_log_is_reported_as_what_it_holds(tmp_path, capsys):
         f'{k:.3f};{np.sin(9 * k):.4f};{np.sin(9 * k - 0.1):.4f}\n' for k in t.tolist()))
     assert report.main([str(log), '--out', str(tmp_path / 'out')]) == 2
     assert 'the columns are a, b, c' in capsys.readouterr().err
-    given = [str(log), '--columns', 't=a,v=b,y=c', '--out', str(tmp_path / 'out')]
-    assert report.main(given) == 0
+    columns = ['--columns', 't=a,v=b,y=c']
+    assert report.main([str(log), *columns, '--out', str(tmp_path / 'out')]) == 0
     page = (tmp_path / 'out' / 'report.html').read_text()
     assert 'no controller has estimated anything' in page
     assert '400 rows, one every 5 ms' in page
@@ -263,9 +251,9 @@ def write_pieces(path: Path, *pieces: Piece) -> Path:
         ):
             name = f'{piece.namespace}{topic.replace("controller", piece.node)}'
             messages += [
-                (START_NS + int(begin_s * 1e9) + k * PERIOD_NS, name, MULTI_ARRAY, raw)
-                for k, raw in rows_of(piece.run, labels, frozenset(), prefix, first)]
-    return write_messages(path, messages)
+                (START_NS + int(begin_s * 1e9) + k * PERIOD_NS, name, made_bags.MULTI_ARRAY, raw)
+                for k, raw in made_bags.rows_of(piece.run, labels, frozenset(), prefix, first)]
+    return made_bags.write_messages(path, messages)
 
 
 @pytest.fixture(scope='module')
@@ -307,28 +295,23 @@ def test_from_and_to_choose_the_other_part(tmp_path, run, second, capsys):
 
 @pytest.mark.usefixtures('undrawn')
 def test_saved_results_are_cut_likewise(tmp_path: Path, run: RunRecord) -> None:
-    report.write_report(Run(run, PARAMETERS), tmp_path)
+    report.write_report(Run(run, made_bags.PARAMETERS), tmp_path)
     part = read_run(tmp_path, span=Span(0.5, 0.8)).record
     assert np.array_equal(part.column('y'), run.column('y')[50:80])
     assert part.column('t')[0] == 0.0
 
 
-def test_truth_belongs_to_the_sample_with_its_v_where_the_counts_differ(tmp_path, run):
-    bag = write_pieces(tmp_path / 'bag', Piece(run, first=179_536_708_930, truth_first=17))
-    u = read_bag(bag).record.column('u')
-    assert np.array_equal(u, run.column('u'))
-
-
-@pytest.mark.usefixtures('undrawn')
-def test_a_truth_that_is_stamped_before_the_first_signals_is_read(tmp_path, run):
-    bag = write_pieces(tmp_path / 'bag', Piece(run, truth_early_s=0.01))
+@pytest.mark.parametrize('truth', [
+    {'first': 179_536_708_930, 'truth_first': 17}, {'truth_early_s': 0.01},
+], ids=['counts differ', 'stamped before the first signals'])
+def test_truth_belongs_to_the_sample_with_its_v(tmp_path, run, truth):
+    bag = write_pieces(tmp_path / 'bag', Piece(run, **truth))
     np.testing.assert_array_equal(read_bag(bag).record.column('u'), run.column('u'))
 
 
 def test_bag_of_two_axes_gives_a_report_of_either(tmp_path, run, second, capsys):
     bag = write_pieces(
-        tmp_path / 'bag', Piece(run, namespace='pan/'), Piece(second, namespace='tilt/')
-    )
+        tmp_path / 'bag', Piece(run, namespace='pan/'), Piece(second, namespace='tilt/'))
     assert same(read_bag(bag, axis='tilt').record, second)
     assert report.main([str(bag), '--out', str(tmp_path / 'out')]) == 0
     assert 'this is pan; --axis tilt chooses another one' in capsys.readouterr().err

@@ -45,8 +45,7 @@ def numbers_in(bag: Path) -> list[float]:
     with AnyReader([bag]) as reader:
         return [
             reader.deserialize(raw, connection.msgtype).data
-            for connection, _, raw in reader.messages() if connection.topic == '/number'
-        ]
+            for connection, _, raw in reader.messages() if connection.topic == '/number']
 
 
 def message_file(bag: Path) -> Path:
@@ -64,12 +63,10 @@ class Finished:
     def __init__(self, folder: Path, storage: str) -> None:
         self.bag = folder / f'{storage}_bag'
         self.flushed: list[tuple[int, int]] = [(0, 0)]
-
         def flush(bag: Bag) -> None:
             bag.flush()
             size = message_file(bag.path).stat().st_size
             self.flushed.append((size, self.flushed[-1][1] + PER_FLUSH))
-
         write_numbers(self.bag, storage, flush)
         self.data = message_file(self.bag).read_bytes()
 
@@ -177,7 +174,7 @@ def file_gone(bag: Path) -> None:
     (shutil.rmtree, 2, 'does not exist'),
     (lambda bag: (shutil.rmtree(bag), bag.touch()), 2, 'is a file: give the folder'),
     (lambda bag: (shutil.rmtree(bag), bag.mkdir()), 2, 'holds no .mcap and no .db3 file'),
-            (nothing_flushed, 1, 'holds no message that could be saved'),
+    (nothing_flushed, 1, 'holds no message that could be saved'),
     (file_gone, 2, 'holds no .mcap and no .db3 file'),
 ])
 def test_what_cannot_be_repaired_is_refused_in_one_line_and_left_as_it_is(
@@ -206,5 +203,4 @@ def test_second_repair_keeps_both_originals(tmp_path, finished):
         assert repair(bag)[-1].endswith(f'/{original}')
     assert repair(bag) == []
     assert sorted(path.name for path in tmp_path.iterdir()) == [
-        'mcap_bag', 'mcap_bag.damaged', 'mcap_bag.damaged.1',
-    ]
+        'mcap_bag', 'mcap_bag.damaged', 'mcap_bag.damaged.1']

@@ -29,17 +29,13 @@ DRIVER = 'drive --axis {axis}'
     (['--set', 'waveform=file'], ['file', 'CSV']),
     (['--set', 'bag=here'], ['bag', 'here', '--out']),
     (['--duration', '0.015'], ['duration', '0.015', 'sample_period']),
-    (['--duration', '-1'], ['duration', '-1']),
-    (['--duration', 'long'], ['--duration', 'long']),
+    (['--duration', '-1'], ['duration', '-1']), (['--duration', 'long'], ['--duration', 'long']),
     (['--driver', 'x', '--lockstep'], ["driver='x'", 'excludes lockstep', 'does not wait']),
     (['--driver', 'x --axis {axis}'], ['driver', 'names an axis', 'axes']),
-    (['--driver', 'x'], [
-        'control.min=-inf', 'set control.min, control.max, control.rate_max',
-        'give --unlimited',
-    ]),
+    (['--driver', 'x'], ['control.min=-inf', 'set control.min, control.max, control.rate_max',
+                         'give --unlimited']),
     (['--driver', 'none', '--set', 'control.min=-5', '--set', 'control.max=5'], [
-        'control.rate_max=inf', 'set control.rate_max, or',
-    ]),
+        'control.rate_max=inf', 'set control.rate_max, or']),
     (['--unlimited'], ['give --driver as well']),
     (['--driver', "x 'y"], ['driver', 'is not a command', 'quotation']),
     (['--axis', 'x'], ["no axis 'x'", 'axes', '/bringup']),
@@ -50,9 +46,8 @@ DRIVER = 'drive --axis {axis}'
     (['--config', 'arm.yaml'], ["driver=''", 'several joints', '`simulate --axis JOINT`']),
     (['--config', 'arm.yaml', '--driver', 'x', '--set', 'waist/control.max=.inf'],
      ['waist.control.max=inf', 'give --unlimited']),
-    (['--config', 'nowhere.yaml'], ['nowhere.yaml']),
+    (['--config', 'nowhere.yaml'], ['nowhere.yaml']), (['--speed', '3'], ['--speed']),
     (['--out', '/proc/nowhere'], ['/proc/nowhere']),
-    (['--speed', '3'], ['--speed']),
     (['--live-port', '70000'], ['--live-port', '70000 must be from 0']),
 ])
 def test_bad_input_is_refused_in_one_line_before_anything_is_made(
@@ -92,8 +87,7 @@ def test_what_the_user_has_set_reaches_the_nodes(tmp_path, monkeypatch):
 def plan(folder: Path, driver: str, *names: str, **values: object) -> RunPlan:
     parameters = effective_parameters(None).replaced({'driver': driver, **values})
     return RunPlan(tuple(
-        AxisPlan(name, parameters, folder / name, record=True) for name in names or ('',)
-    ))
+        AxisPlan(name, parameters, folder / name, record=True) for name in names or ('',)))
 
 
 def names_of(stages: list[list[Child]]) -> list[list[str]]:
@@ -102,8 +96,7 @@ def names_of(stages: list[list[Child]]) -> list[list[str]]:
 
 def test_plant_stops_first_but_a_driver_only_after_the_controller(tmp_path: Path) -> None:
     assert names_of(plan_processes(plan(tmp_path, ''), None)) == [
-        ['plant'], ['reference'], ['controller'], ['recorder'],
-    ]
+        ['plant'], ['reference'], ['controller'], ['recorder']]
     stages = plan_processes(plan(tmp_path, 'run it', sample_period=0.05), None)
     assert names_of(stages) == [['controller'], ['driver'], ['reference'], ['recorder']]
     assert stages[1][0].command == ('run', 'it')
@@ -111,16 +104,14 @@ def test_plant_stops_first_but_a_driver_only_after_the_controller(tmp_path: Path
     slow = plan_processes(plan(tmp_path, 'run it', **{'timeout.ramp': 20.0}), None)
     assert [stage[0].grace_s for stage in slow] == [20.0, 0.0, 0.0, 0.0]
     assert names_of(plan_processes(plan(tmp_path, 'none'), None)) == [
-        ['controller'], [], ['reference'], ['recorder'],
-    ]
+        ['controller'], [], ['reference'], ['recorder']]
 
 
 def test_axes_with_the_same_command_share_one_driver(tmp_path: Path) -> None:
     stages = plan_processes(plan(tmp_path, 'both --axes', 'x', 'y'), None)
     assert names_of(stages) == [
         ['x/controller', 'y/controller'], ['driver of x, y'], ['x/reference', 'y/reference'],
-        ['x/recorder', 'y/recorder'],
-    ]
+        ['x/recorder', 'y/recorder']]
     assert stages[1][0].log == tmp_path / 'x' / 'logs' / 'driver.log'
 
 
@@ -128,8 +119,7 @@ def test_foreign_program_gets_no_variables_that_were_made_for_this_python() -> N
     own, user = f'{sys.prefix}/lib', '/opt/user/lib'
     made = {
         '_ROS_WHEELS_BOOTSTRAP_COMPLETE': '1', 'BACKLASH_ROS_EVENTS': '1', 'HOME': '/home',
-        'LD_LIBRARY_PATH': os.pathsep.join([own, user]),
-    }
+        'LD_LIBRARY_PATH': os.pathsep.join([own, user])}
     assert foreign_environment(made) == {'HOME': '/home', 'LD_LIBRARY_PATH': user}
     del made['_ROS_WHEELS_BOOTSTRAP_COMPLETE']
     assert foreign_environment(made)['LD_LIBRARY_PATH'] == made['LD_LIBRARY_PATH']
@@ -137,8 +127,7 @@ def test_foreign_program_gets_no_variables_that_were_made_for_this_python() -> N
 
 def planned(folder: Path, *arguments: str) -> RunPlan:
     return prepare(bringup.parse_options(
-        ['--config', str(CONFIG), '--out', str(folder), *arguments]
-    ))
+        ['--config', str(CONFIG), '--out', str(folder), *arguments]))
 
 
 def test_each_axis_gets_a_driver_in_whose_command_it_is_named(tmp_path: Path) -> None:
@@ -160,8 +149,7 @@ def test_one_axis_alone_can_be_taken_from_the_file(tmp_path: Path) -> None:
     assert (*values, axis.parameters.frequency) == (0.8, 1.0, -2.0, 9.0)
     processes = [process for stage in plan_processes(plan, None) for process in stage]
     assert [process.name for process in processes] == [
-        'tilt/plant', 'tilt/reference', 'tilt/controller', 'tilt/recorder',
-    ]
+        'tilt/plant', 'tilt/reference', 'tilt/controller', 'tilt/recorder']
     assert all('__ns:=/tilt' in process.command for process in processes)
 
 

@@ -84,8 +84,7 @@ def test_written_configuration_is_read_back_unchanged(config: Path) -> None:
         'control.min': -0.1, 'control.rate_max': 5.5, 'lockstep': True,
         'file': "it's a: file.csv", 'seed': 7, 'backlash.jump': [0.0, 1e22, -0.5],
         'truth.numerator': [0.5], 'truth.denominator': [1.0, -0.5],
-        'actuator.numerator': [0.5], 'actuator.denominator': [1.0, -0.5],
-    })
+        'actuator.numerator': [0.5], 'actuator.denominator': [1.0, -0.5]})
     write_config(parameters, config)
     again = read_configuration(config).given('x')
     assert Parameters(again) == parameters
@@ -101,11 +100,8 @@ def test_written_configuration_is_read_back_unchanged(config: Path) -> None:
      'seed has two values, 1 and 2'),
     ('/controller: {ros__parameters: {seed: 1}}', 'is not a parameter of controller'),
     ('/**: {ros__parameters: {seed: 1, seed: 2}}', "'seed' is given twice"),
-    ('/**: {seed: 1}', 'must hold sections'),
-    ('/**: {ros__parameters: }', 'must hold sections'),
-    ('/**: {ros__parameters: {seed: [}}', 'line 1'),
-    ('seed', 'must hold'),
-    ('', 'must hold'),
+    ('/**: {seed: 1}', 'must hold sections'), ('/**: {ros__parameters: }', 'must hold sections'),
+    ('/**: {ros__parameters: {seed: [}}', 'line 1'), ('seed', 'must hold'), ('', 'must hold'),
     ('/**: {ros__parameters: {5: 1}}', '5 is not a parameter'),
     ('/contoller: {ros__parameters: {seed: 1}}', 'did you mean /controller?'),
     ('/x/contoller: {ros__parameters: {seed: 1}}', 'did you mean /x/controller?'),
@@ -133,12 +129,9 @@ def test_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(('text', 'expected'), [
-    ('seed=3', ('seed', 3)),
-    ('lockstep=true', ('lockstep', True)),
-    ('axes=[x, y]', ('axes', ('x', 'y'))),
-    ('axes=[]', ('axes', ())),
+    ('seed=3', ('seed', 3)), ('lockstep=true', ('lockstep', True)), ('axes=[]', ('axes', ())),
+    ('axes=[x, y]', ('axes', ('x', 'y'))), ('file=2024', ('file', '2024')),
     ('plant.numerator=[1, 2e-3]', ('plant.numerator', (1.0, 2e-3))),
-    ('file=2024', ('file', '2024')),
     ('estimator.law=lms', ('estimator.law', 'lms')),
 ])
 def test_setting_is_read_like_a_line_of_yaml(text: str, expected: tuple[str, object]) -> None:
@@ -146,16 +139,11 @@ def test_setting_is_read_like_a_line_of_yaml(text: str, expected: tuple[str, obj
 
 
 @pytest.mark.parametrize(('text', 'message'), [
-    ('seed', 'must be KEY=VALUE'),
-    ('/seed=1', 'must be KEY=VALUE'),
-    ('x/sed=1', 'did you mean seed'),
-    ('x/axes=[y]', 'is for the whole run'),
-    ('axes=[on]', 'quote true, on'),
-    ('axes=[a/b]', 'must be a list of names'),
-    ('sed=1', 'did you mean seed'),
-    ('seed=x', 'must be a number'),
-    ('seed=[', 'is not a value in YAML'),
-    ('structure=square', 'must be one of'),
+    ('seed', 'must be KEY=VALUE'), ('/seed=1', 'must be KEY=VALUE'),
+    ('sed=1', 'did you mean seed'), ('x/sed=1', 'did you mean seed'),
+    ('axes=[on]', 'quote true, on'), ('axes=[a/b]', 'must be a list of names'),
+    ('x/axes=[y]', 'is for the whole run'), ('structure=square', 'must be one of'),
+    ('seed=x', 'must be a number'), ('seed=[', 'is not a value in YAML'),
 ])
 def test_bad_setting_is_refused(text: str, message: str) -> None:
     with pytest.raises((InputError, ParameterError), match=message):
@@ -182,8 +170,7 @@ def test_named_node_goes_before_named_axis_and_that_before_all(config, sections)
     left = list(sections)
     for specific in ('/x/plant', '/**/plant', '/x/**', '/**'):
         text = AXES + ''.join(
-            f'{name}: {{ros__parameters: {{seed: {values[name]}}}}}\n' for name in left
-        )
+            f'{name}: {{ros__parameters: {{seed: {values[name]}}}}}\n' for name in left)
         written(config, text)
         assert effective_parameters(config, axis='x')['seed'] == values[specific]
         left.remove(specific)
@@ -219,16 +206,14 @@ LAST = {'m': 1.30029, 'c_r': 3.00258, 'c_l': -2.99812}  # as 0.2.0 printed them
 def test_parameter_file_means_what_it_meant() -> None:
     parameters = effective_parameters(OLD / 'parameters.yaml')
     assert (parameters.lockstep, parameters.samples, parameters.output_noise_std) == (
-        True, 50, 1e-4,
-    )
+        True, 50, 1e-4)
     assert parameters.estimator.law == 'moving_horizon'
     build_controller(parameters)
 
 
 def test_saved_estimates_are_begun_with() -> None:
     parameters = effective_parameters(OLD / 'parameters.yaml', [
-        'estimates.load=true', f'estimates.file={OLD / "estimates.json"}',
-    ])
+        'estimates.load=true', f'estimates.file={OLD / "estimates.json"}'])
     found = load_estimate(parameters)
     assert {name: getattr(found, name) for name in LAST} == pytest.approx(LAST, rel=1e-5)
     assert found.learned

@@ -77,8 +77,7 @@ def test_summary_tells_the_states_by_their_share(run: run_record.RunRecord) -> N
 def test_summary_and_record_tell_the_model_that_was_believed_at_the_end(run, tmp_path):
     summary = summarise(replace(run, learned=LEARNED), None)
     assert summary['model'] == {
-        'numerator': [0.1, 0.05], 'denominator': [1.0, -0.9], 'delay_samples': 1,
-    }
+        'numerator': [0.1, 0.05], 'denominator': [1.0, -0.9], 'delay_samples': 1}
     assert (summary['noise_ratio'], summary['unexplained']) == (1.1, 0.02)
     unknown = summarise(replace(run, learned=None), None)
     assert [unknown[name] for name in ('model', 'noise_ratio', 'unexplained')] == [None] * 3
@@ -117,8 +116,7 @@ def test_file_is_replaced_whole_or_not_at_all(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(('text', 'message'), [
-    ('', 'line 1: must be the header'),
-    ('a,b\n1,2\n', 'line 1: must be the header'),
+    ('', 'line 1: must be the header'), ('a,b\n1,2\n', 'line 1: must be the header'),
     (f'{OLD_HEADER}\n', 'must hold rows of 10 numbers'),
     (f'{OLD_HEADER}\n0,1\n', 'must hold rows of 10 numbers'),
     (f'{OLD_HEADER}\n0,1,1,1,1,x,1,1,1,1\n', "could not convert string to float: 'x'"),
