@@ -40,17 +40,16 @@ def measure_simulation(_: float) -> Measured:
 
 def simulation_speeds(values: Mapping[str, object]) -> list[str]:
     """Samples per second until the backlash is learned, and after that."""
-    loop = build_closed_loop(Parameters(values))
-    times = [time.perf_counter()]
 
-    def note(k: int) -> None:
-        if k + 1 in (ACQUIRED, SIMULATED_SAMPLES):
-            times.append(time.perf_counter())
+    def seconds(samples: int) -> float:
+        loop = build_closed_loop(Parameters(values))
+        start = time.perf_counter()
+        loop.run(samples)
+        return time.perf_counter() - start
 
-    loop.run(SIMULATED_SAMPLES, note)
-    start, acquired, end = times
-    return [f'{ACQUIRED / (acquired - start):.0f}',
-            f'{(SIMULATED_SAMPLES - ACQUIRED) / (end - acquired):.0f}']
+    acquired, whole = seconds(ACQUIRED), seconds(SIMULATED_SAMPLES)
+    return [f'{ACQUIRED / acquired:.0f}',
+            f'{(SIMULATED_SAMPLES - ACQUIRED) / (whole - acquired):.0f}']
 
 
 class Part(NamedTuple):
