@@ -113,7 +113,8 @@ def plant_facts() -> str:
     return markdown(('of G(z)', 'value', 'and therefore'), (
         ('poles', ', '.join(f'{pole:.5f}' for pole in poles),
          'an integrator and two lags: a constant error of u makes y drift'),
-        ('zeros', ', '.join(f'{zero.real:.3f}' for zero in sorted(np.roots(model.numerator), key=abs)),
+        ('zeros', ', '.join(f'{zero.real:.3f}'
+                            for zero in sorted(np.roots(model.numerator), key=abs)),
          'one outside the unit circle: u cannot be had by running 1/G forwards in time'),
         (f'gain at {frequency:g} rad/s', f'{gain:.4f}',
          f'with u_d ≈ y_m, y swings by about ±{gain * p.amplitude:.2f}, not by ±10'),
