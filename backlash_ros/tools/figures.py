@@ -82,8 +82,9 @@ def band(axes: Axes, t: Array, low: Array, high: Array, colour: str, name: str =
 
 
 def shade(axes: Axes, t: Array, where: NDArray[np.bool_], name: str) -> None:
-    axes.fill_between(t, 0, 1, where=where.tolist(), transform=axes.get_xaxis_transform(),
-                      step='post', color='#bbbbbb', alpha=0.4, linewidth=0, label=name)
+    if where.any():  # otherwise it is not in the legend either
+        axes.fill_between(t, 0, 1, where=where.tolist(), transform=axes.get_xaxis_transform(),
+                          step='post', color='#bbbbbb', alpha=0.4, linewidth=0, label=name)
 
 
 def limits(values: Sequence[Array], margin: float) -> tuple[float, float]:
