@@ -21,7 +21,7 @@ from backlash_ros.tools import cli
 from backlash_ros.tools.config import effective_parameters
 from backlash_ros.tools.runs.files import result_directory
 from backlash_ros.tools.runs.read_run import run_loop
-from backlash_ros.tools.runs.summary import ErrorCurves, control_error, moving_rms
+from backlash_ros.tools.runs.summary import ErrorCurves, moving_rms
 
 COMPARISON_HEADER = (
     'loop', 'control error', 'tracking error', 'backlash penalty', 'total variation of v',
@@ -101,7 +101,7 @@ def _measure(
         run_record.control_error_rms(run), error, penalty,
         run_record.total_variation(run.column('v')[t >= since]),
         run_record.gap_crossings_per_reversal(run, since),
-    ), ErrorCurves(name, t, moving_rms(control_error(run), run.sample_period), tracking))
+    ), ErrorCurves(name, t, moving_rms(run_record.control_error(run), run.sample_period), tracking))
 
 
 def make_parser() -> argparse.ArgumentParser:

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.plant.backlash import Backlash
+from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.simulation.run_record import SETTLING_TOLERANCE, RunRecord
 from backlash_ros.tools.cli import number
 from backlash_ros.tools.runs.summary import ERROR_WINDOW_S, ErrorCurves, Part
 from backlash_ros.topics import BACKLASH
 
-Array = NDArray[np.float64]
 Line = tuple[Any, ...]  # what `curve` takes behind the axes: t, values, colour and further ones
 
 TIME_LABEL = 'time t [s]'  # label of an axis

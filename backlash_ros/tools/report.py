@@ -12,7 +12,7 @@ import numpy as np
 
 from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.simulation.run_record import RunRecord
+from backlash_ros.core.simulation.run_record import RunRecord, control_error
 from backlash_ros.options import OptionParser
 from backlash_ros.tools import cli, figures
 from backlash_ros.tools.cli import NOTHING, number
@@ -63,7 +63,7 @@ def _figures(
                       'with level stretches where v turns.', png(figures.draw_log(run)))
         return
     start, end = parts = told.interesting_parts(run)
-    truth, error, innovation = run.has_truth, told.control_error(run), run.column('innovation')
+    truth, error, innovation = run.has_truth, control_error(run), run.column('innovation')
     curves, notes = told.compare_laws(run, parameters) if truth and parameters else ([], [])
     known = np.isfinite(error).any()
     duration = min(float(run.column('t')[-1]) + run.sample_period, 1e4 * run.sample_period)

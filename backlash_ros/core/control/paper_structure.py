@@ -100,9 +100,7 @@ class PolePlacement(ControlStructure):
         self._r: Array = np.zeros(len(blocks.demand[0]))
         self._asked: Array = np.zeros(len(blocks.demand[1]) - 1)
         self._largest_asked = 0.0  # largest of it so far
-        b, a = blocks.reference.numerator, blocks.reference.denominator
-        self.delay = round(float(  # the group delay at z = 1
-            np.polyval(np.polyder(a), 1.0) / a.sum() - np.polyval(np.polyder(b), 1.0) / b.sum()))
+        self.delay = round(blocks.reference.group_delay)
 
     def go_on_from(self, other: ControlStructure, state_known: bool = True) -> None:
         if isinstance(other, PolePlacement) and other._w.shape == self._w.shape:

@@ -47,6 +47,13 @@ class TransferFunction:
         """Samples between u and its first effect on y."""
         return int(np.flatnonzero(self.numerator)[0])
 
+    @property
+    def group_delay(self) -> float:
+        """Samples by which it delays slow motion; no number with a zero or a pole at z = 1."""
+        b, a = self.numerator, self.denominator
+        return float(np.polyval(np.polyder(a), 1.0) / a.sum()
+                     - np.polyval(np.polyder(b), 1.0) / b.sum())
+
     def response(self, z: Roots) -> Roots:
         """G at the points z."""
         return np.asarray(np.polyval(self.numerator, z) / np.polyval(self.denominator, z))

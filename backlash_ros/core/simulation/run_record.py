@@ -121,9 +121,14 @@ def settling_time(t: Array, estimate: Array, truth: Array) -> float | None:
     return float(t[settled][0]) if settled.any() else None
 
 
+def control_error(run: RunRecord) -> Array:
+    """e = u - u_d (3.4) of each sample, shape (N,); nan where u is unknown."""
+    return run.column('u') - run.column('u_d')
+
+
 def control_error_rms(run: RunRecord) -> float | None:
-    """RMS of e = u - u_d (3.4) over the last second [unit of u]; None without the true u."""
-    e = (run.column('u') - run.column('u_d'))[run.column('t') > run.column('t')[-1:] - 1.0]
+    """RMS of e over the last second [unit of u]; None without the true u."""
+    e = control_error(run)[run.column('t') > run.column('t')[-1:] - 1.0]
     e = e[np.isfinite(e)]
     return float(np.sqrt(np.mean(e**2))) if e.size else None
 

@@ -19,12 +19,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.records.record import RecordError
 from backlash_ros.tools.records.columns import UNITS_S, columns_of, unit_of
-
-Array = NDArray[np.float64]
 
 MOST_BROKEN = 0.1  # share of the lines that may be broken, and of the cells that are no number
 

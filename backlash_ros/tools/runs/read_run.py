@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 
 from backlash_ros import topics
 from backlash_ros.bags import REPAIR_COMMAND, BagError, BagReader, Topic, is_bag
+from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.simulation.closed_loop import ClosedLoop
 from backlash_ros.core.simulation.run_record import COLUMNS, LearnedModel, RunRecord, from_fields
 from backlash_ros.tools.cli import WHOLE_SPAN, BrokenOffError, InputError, Span
@@ -22,7 +22,6 @@ from backlash_ros.tools.config import read_configuration
 from backlash_ros.tools.runs import files
 from backlash_ros.tools.runs.files import BAG, CONFIG_FILE, RECORD_FILE, SAMPLES_FILE, Run
 
-Array = NDArray[np.float64]
 Messages = list[tuple[int, Any]]  # with their stamps [ns], in the order of these
 # Messages of an array topic by label, shape (N,) each, and their `stamp` [ns] since the first.
 Table = dict[str, Array]

@@ -5,19 +5,17 @@ from math import isfinite
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from backlash_ros.core.assembly import LAWS, build_structure, first_guess, law_fits
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.parameters import ParameterError, Parameters
+from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.simulation import run_record
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
-from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
+from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord, control_error
 from backlash_ros.tools.cli import NOTHING, BrokenOffError, InputError, format_table
 from backlash_ros.tools.runs.read_run import run_loop
 from backlash_ros.topics import BACKLASH
-
-Array = NDArray[np.float64]
 
 ERROR_WINDOW_S = 0.5  # over which the error of a curve is averaged
 ESTIMATE_HEADER = ('estimate', 'std', 'truth', 'error', 'within 1 % from')
@@ -107,11 +105,6 @@ def estimate_table(summary: Mapping[str, Any], title: str = '') -> str:
     """The estimates of a run as text; title: of the first column."""
     return format_table((title, *ESTIMATE_HEADER),
                         [(name, *estimate_cells(summary, name)) for name in BACKLASH])
-
-
-def control_error(run: RunRecord) -> Array:
-    """e = u - u_d (3.4) of each sample, shape (N,); nan where u is unknown."""
-    return run.column('u') - run.column('u_d')
 
 
 def interesting_parts(run: RunRecord) -> tuple[Part, Part]:

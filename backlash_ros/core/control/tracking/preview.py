@@ -92,8 +92,7 @@ def _holding(model: TransferFunction, window: int) -> Array:
     # Less than rounding of the coefficients is a zero or a pole at z = 1.
     if abs(b_1) <= 1e-9 * np.abs(b).sum() or abs(a_1) <= 1e-9 * np.abs(a).sum():
         return taps  # nothing holds y, or u = 0 does
-    delay = float(np.polyval(np.polyder(a), 1.0) / a_1 - np.polyval(np.polyder(b), 1.0) / b_1)
-    whole, part = divmod(min(max(delay, 0.0), float(window)), 1.0)
+    whole, part = divmod(min(max(model.group_delay, 0.0), float(window)), 1.0)
     taps[int(whole)] = 1.0 - part
     taps[min(int(whole) + 1, window)] += part
     return taps * (a_1 / b_1)
