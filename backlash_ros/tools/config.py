@@ -20,32 +20,15 @@ from backlash_ros.tools.cli import InputError
 ANY = '**'
 
 
-class Section(NamedTuple):
-    """Checked values of a file; axis: a name, ANY, or '' for a node without a namespace."""
-
-    name: str
-    axis: str
-    node: str
-    values: Mapping[str, Value]
-
-    def is_for(self, *axes: str) -> bool:
-        return self.axis in (ANY, *axes) or (self.node == BRINGUP and not self.axis)
-
-
-class Setting(NamedTuple):
-    """One --set: axis is empty for all axes."""
-
-    axis: str
-    name: str
-    value: Value
-
-
 class Configuration(NamedTuple):
-    """A file with what the command line changes in it; axes of controllers, joints of one."""
+    """A file with what the command line changes in it; axes of controllers, joints of one.
+
+    sections: checked values by their names; settings: axis, empty for all, name and value.
+    """
 
     path: Path
-    sections: Sequence[Section]
-    settings: Sequence[Setting]
+    sections: Mapping[str, Mapping[str, Value]]
+    settings: Sequence[tuple[str, str, Value]]
     seed: int | None
     axes: tuple[str, ...]
     joints: tuple[str, ...]
@@ -59,10 +42,12 @@ class Configuration(NamedTuple):
 
     def of_controller(self, axis: str = '') -> Parameters:
         """Return the same for one controller, with what each of its joints has of its own."""
-        values: dict[str, object] = dict(self.given(axis))
-        for meant in ('', axis):
-            values |= {s.name: s.value for s in self.settings if s.axis == meant}
-        values |= {f'{s.axis}.{s.name}': s.value for s in self.settings if s.axis in self.joints}
+        values: dict[str, object] = {**self.given(axis)}
+        for meant, name, value in sorted(self.settings, key=lambda setting: setting[0] != ''):
+            if meant in ('', axis):
+                values[name] = value
+            elif meant in self.joints:
+                values[f'{meant}.{name}'] = value
         if self.seed is not None:
             values['seed'] = self.seed
         values.pop('axes', None)
@@ -75,31 +60,53 @@ class Configuration(NamedTuple):
                              f'be used here: choose it, like --axis {self.axes[0]}')
         if axis and axis not in self.axes:
             raise InputError(_no_such_axis(axis, self.axes))
-        return _merged(self.path, [section for section in self.sections if section.is_for(axis)])
+        values: dict[str, Value] = {}
+        for equals in _sections_for(axis):
+            found: dict[str, Value] = {}
+            for section in equals:
+                for name, value in self.sections.get(section, {}).items():
+                    if found.setdefault(name, value) != value:
+                        raise InputError(f'{self.path}: {name} has two values, {found[name]!r} '
+                                         f'and {value!r}')
+            values |= found
+        return values
+
+
+def _sections_for(axis: str) -> tuple[list[str], ...]:
+    """Names of what concerns an axis, '' for a loop without one, the most specific ones last."""
+    own = f'/{axis}' if axis else ''
+    return ([f'/{ANY}'], [f'{own}/{ANY}'], [f'/{ANY}/{node}' for node in catalogue.NODES],
+            [f'/{BRINGUP}', *(f'{own}/{node}' for node in catalogue.NODES)])
 
 
 def read_configuration(
     config: Path | None, settings: Sequence[str] = (), seed: int | None = None,
 ) -> Configuration:
     """Read and check everything, as `find_config` finds it; raises InputError, ParameterError."""
-    path = find_config(config)
-    sections, parsed = _read_sections(path), list(map(parse_setting, settings))
-    listed: dict[str, Any] = {
-        name: _merged(path, [each for each in sections if name in each.values]).get(name, ())
-        for name in ('axes', 'joints')
-    }
-    listed |= {name: value for _, name, value in parsed if name == 'axes'}
-    axes, joints = listed['axes'], listed['joints']
+    path, parsed = find_config(config), list(map(parse_setting, settings))
+    sections = _read_sections(path)
+    try:
+        listed: dict[str, Any] = {
+            name: catalogue.check_value(BY_NAME[name], values[name])
+            for values in sections.values() for name in ('axes', 'joints') if name in values}
+        listed |= {name: value for _, name, value in parsed if name == 'axes'}
+        axes, joints = listed.get('axes', ()), listed.get('joints', ())
+        known = [name for axis in axes or ('',) for names in _sections_for(axis) for name in names]
+        for section in sections:
+            if section not in known:
+                where = f'the axes {", ".join(axes)}' if axes else \
+                    f'a run without the parameter axes, under /{BRINGUP}'
+                near = difflib.get_close_matches(section, known, n=1, cutoff=0.0)[0]
+                raise InputError(
+                    f'section {section!r} is for no node of {where}: did you mean {near}?')
+        checked = {name: _checked(name, values, joints) for name, values in sections.items()}
+    except (ParameterError, InputError) as error:
+        error.args = (f'{path}: {error}',)
+        raise
     for axis, name, _ in parsed:
         if axis and axis not in (axes or joints):
             raise InputError(f'--set {axis}/{name}: {_no_such_axis(axis, axes or joints)}')
-    for section in sections:
-        if not section.is_for(*axes or ('',)):
-            rule = f': {_no_such_axis(section.axis, axes)}' if section.axis else (
-                f' belongs to no axis: write /{ANY}/{section.node} for all axes or '
-                f'/{axes[0]}/{section.node} for one')
-            raise InputError(f'{path}: section {section.name!r}{rule}')
-    return Configuration(path, sections, parsed, seed, axes, () if axes else joints)
+    return Configuration(path, checked, parsed, seed, axes, () if axes else joints)
 
 
 def effective_parameters(
@@ -109,40 +116,24 @@ def effective_parameters(
     return read_configuration(config, settings, seed).parameters(axis)
 
 
-def parse_setting(text: str) -> Setting:
+def parse_setting(text: str) -> tuple[str, str, Value]:
     """Return the checked content of `KEY=VALUE` or `AXIS/KEY=VALUE`, the value as in YAML."""
     key, equals, given = text.partition('=')
     axis, slash, name = key.strip().rpartition('/')
     if not equals or (slash and not axis):
         raise InputError(f'--set {text!r} must be KEY=VALUE or AXIS/KEY=VALUE')
     catalogue.check_names([name])
-    if axis and name == 'axes':
-        raise ParameterError(name, given, 'is for the whole run', 'write --set axes=...')
     try:
         value = given if isinstance(BY_NAME[name].default, str) else yaml.safe_load(given)
     except yaml.YAMLError:
         raise ParameterError(name, given, 'is not a value in YAML') from None
-    return Setting(axis, name, catalogue.check_value(BY_NAME[name], value))
+    return axis, name, catalogue.check_value(BY_NAME[name], value)
 
 
 def _no_such_axis(axis: str, axes: Sequence[str]) -> str:
-    if not axes:
-        return f'there is no axis {axis!r}: list it in the parameter axes under /{BRINGUP}'
-    near = difflib.get_close_matches(axis, axes, n=1, cutoff=0.0)[0]
-    return f'there is no axis {axis!r} among {", ".join(axes)}: did you mean {near}?'
-
-
-def _merged(path: Path, sections: Sequence[Section]) -> dict[str, Value]:
-    """The values of sections, of each name those of the most specific; raises InputError."""
-    merged: dict[str, tuple[tuple[bool, bool], Value]] = {}
-    for rank, section in sorted((((s.node != ANY, s.axis not in (ANY, '')), s) for s in sections),
-                                key=lambda each: each[0]):
-        for name, value in section.values.items():
-            known, other = merged.get(name, (rank, value))
-            if known == rank and other != value:
-                raise InputError(f'{path}: {name} has two values, {other!r} and {value!r}')
-            merged[name] = rank, value
-    return {name: value for name, (_, value) in merged.items()}
+    known = f' among {", ".join(axes)}' if axes else \
+        f': list it in the parameter axes under /{BRINGUP}'
+    return f'there is no axis {axis!r}{known}'
 
 
 class _StrictLoader(yaml.SafeLoader):
@@ -157,27 +148,22 @@ class _StrictLoader(yaml.SafeLoader):
         return super().construct_mapping(node, deep=deep)
 
 
-def _read_sections(path: Path) -> list[Section]:
+def _read_sections(path: Path) -> dict[str, dict[str, object]]:
+    """Values of the sections, by their names with and by their own flat names."""
     try:
         document = yaml.load(path.read_text(encoding='utf-8'), Loader=_StrictLoader)
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         reason = error.strerror if isinstance(error, OSError) else ' '.join(str(error).split())
         raise InputError(f'{path}: cannot be read: {reason}') from None
-    try:
-        sections = {}
-        for name, content in document.items() if isinstance(document, dict) else ():
-            if isinstance(content, dict) and [*content] == ['ros__parameters'] \
-                    and isinstance(content['ros__parameters'], dict):
-                sections[str(name)] = dict(flattened(content['ros__parameters']))
-        if not sections or len(sections) < len(document):
-            raise InputError('must hold sections "NAME: {ros__parameters: {name: value, ...}}"')
-        # What is wrong with the values of a joint, all values together tell.
-        joints = [joint for values in sections.values()
-                  for joint in Parameters({'joints': values.get('joints', ())}).joints]
-        return [_checked(name, values, joints) for name, values in sections.items()]
-    except (ParameterError, InputError) as error:
-        error.args = (f'{path}: {error}',)
-        raise
+    sections = {}
+    for name, content in document.items() if isinstance(document, dict) else ():
+        values = content.get('ros__parameters') if isinstance(content, dict) else None
+        if isinstance(values, dict) and len(content) == 1:
+            sections[f'/{str(name).removeprefix("/")}'] = dict(flattened(values))
+    if not sections or len(sections) < len(document):
+        raise InputError(f'{path}: must hold sections "NAME: {{ros__parameters: {{name: value, '
+                         '...}}", each once')
+    return sections
 
 
 def flattened(tree: Mapping[object, object], prefix: str = '') -> Iterator[tuple[str, object]]:
@@ -189,28 +175,20 @@ def flattened(tree: Mapping[object, object], prefix: str = '') -> Iterator[tuple
             yield f'{prefix}{key}', value
 
 
-def _checked(name: str, values: Mapping[str, object], joints: Sequence[str]) -> Section:
-    axis, _, node = name.removeprefix('/').rpartition('/')
-    if name == f'/{ANY}':
-        axis = ANY
-    elif '/' in axis or not (node in catalogue.NODES or (node == ANY and axis not in ('', ANY))):
-        known = [f'/{ANY}', *(f'/{each}' for each in catalogue.NODES)]
-        similar = [*known, *(f'/{axis}/{each}' for each in (*catalogue.NODES, ANY))]
-        near = difflib.get_close_matches(name, similar, n=1)
-        raise InputError(f'section {name!r} is none of {", ".join(known)}, /AXIS/{ANY}, '
-                         '/AXIS/controller ...' + ''.join(f': did you mean {n}?' for n in near))
+def _checked(
+    section: str, values: Mapping[str, object], joints: Sequence[str],
+) -> dict[str, Value]:
+    node = section.rpartition('/')[2]
     Parameters({'joints': joints, **values})  # checks all names and values
     checked = {}
-    for key, value in values.items():
-        entry = catalogue.entry_of(key)
+    for name, value in values.items():
+        entry = catalogue.entry_of(name)
         assert entry is not None
-        checked[key] = catalogue.check_value(entry, value)
+        checked[name] = catalogue.check_value(entry, value)
         if node not in (ANY, *entry.used_by):
-            raise ParameterError(key, checked[key], f'is not a parameter of {node}',
+            raise ParameterError(name, checked[name], f'is not a parameter of {node}',
                                  f'put it under /{ANY} or /{entry.used_by[0]}')
-        if key == 'axes' and axis not in (ANY, ''):
-            raise ParameterError(key, value, 'is for the whole run', f'put it under /{BRINGUP}')
-    return Section(name, axis, node, checked)
+    return checked
 
 
 class _Dumper(yaml.SafeDumper):
@@ -228,19 +206,16 @@ def write_config(parameters: Parameters, path: Path) -> None:
 
 def config_text(parameters: Parameters) -> str:
     """Content of that file, without empty lists, which ROS 2 does not have."""
-    common = [p for p in BY_NAME.values() if p.used_by != (BRINGUP,) and parameters[p.name] != ()]
-    own = [p.name for p in BY_NAME.values()
-           if p not in common and parameters[p.name] != p.default]
-    of_all = _tree(parameters, (p.name for p in common))
+    common = [p for p in BY_NAME.values() if parameters[p.name] != ()
+              and (p.used_by != (BRINGUP,) or parameters[p.name] != p.default)]
+    tree = _tree(parameters, (p.name for p in common))
     for joint in parameters.joints:
         of_joint = parameters.of_joint(joint)
-        of_all[joint] = _tree(of_joint, (
+        tree[joint] = _tree(of_joint, (
             p.name for p in common if catalogue.CONTROLLER in p.used_by and not p.per_node
             and of_joint[p.name] != parameters[p.name]))
-    document = {f'/{ANY}': {'ros__parameters': of_all}}
-    if own:
-        document[f'/{BRINGUP}'] = {'ros__parameters': _tree(parameters, own)}
-    return yaml.dump(document, Dumper=_Dumper, sort_keys=False, width=1000)
+    return yaml.dump({f'/{ANY}': {'ros__parameters': tree}}, Dumper=_Dumper, sort_keys=False,
+                     width=1000)
 
 
 def _tree(parameters: Parameters, names: Iterable[str]) -> dict[str, Any]:

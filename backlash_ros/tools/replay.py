@@ -81,9 +81,9 @@ def _opened(path: Path, options: argparse.Namespace, span: cli.Span) -> Source:
         raise cli.InputError(f'{path}: no parameters.yaml stands beside it: give --config, like '
                              'identified.yaml of `identify`')
     settings = list(map(parse_setting, options.settings))
-    if any(setting.axis for setting in settings):
+    if any(axis for axis, *_ in settings):
         raise cli.InputError('--set: leave out the axis: there is one run')
-    parameters = run.parameters.replaced({setting.name: setting.value for setting in settings})
+    parameters = run.parameters.replaced({name: value for _, name, value in settings})
     if applied is not None:
         # Its v is what acted, in every interval.
         parameters = parameters.replaced({'estimator.use_applied_control': 'true'})

@@ -42,9 +42,9 @@ def processes_in(domain: int, commands: Mapping[str, Sequence[str]]) -> Iterator
         folder = Path(name)
         environment = child_environment(folder, domain)
         # What is no node of the package is foreign.
-        stages = [[Child(who, tuple(command), folder / f'{who}.log', environment,
-                         foreign='-m' not in command)] for who, command in commands.items()]
-        with ProcessSupervisor(stages, lambda: False) as supervisor:
+        stages = [[Child(who, command, folder / f'{who}.log', foreign='-m' not in command)]
+                  for who, command in commands.items()]
+        with ProcessSupervisor(stages, environment) as supervisor:
             yield supervisor
 
 

@@ -27,7 +27,6 @@ from functools import partial
 
 from backlash_ros.options import DONE, FAILED, OptionParser, port
 from backlash_ros.tools import cli
-from backlash_ros.tools.cli import StopRequests
 
 
 def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -51,13 +50,13 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 def _bringup(arguments: Sequence[str] | None) -> int:
     options = parse_options(arguments)
-    with StopRequests() as requests:
-        # numpy and scipy take a second to load, in which a Ctrl-C is to be heard already.
-        from backlash_ros.tools.bringup.plan import prepare
-        from backlash_ros.tools.bringup.watch import report, run
-        watch = run(prepare(options), requests)
-    reported = [axis.made > 0 and report(axis.plan) for axis in watch.axes.values()]
-    return DONE if all(reported) and not watch.failure else FAILED
+    # numpy and scipy take a second to load, in which a Ctrl-C is to be heard already.
+    from backlash_ros.tools.bringup.plan import prepare
+    from backlash_ros.tools.bringup.watch import report, run
+    plan = prepare(options)
+    failure = run(plan)
+    reported = [axis.made > 0 and report(axis, plan.record) for axis in plan.axes]
+    return DONE if all(reported) and not failure else FAILED
 
 
 main = partial(cli.run_tool, 'bringup', _bringup)

@@ -3,42 +3,57 @@
 import argparse
 import shlex
 import sys
-from collections.abc import Sequence
+import time
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from math import inf
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from backlash_ros import topics
 from backlash_ros.core.assembly import build_controller, build_plant, build_reference
 from backlash_ros.core.parameters import ParameterError, Parameters
 from backlash_ros.middleware import ROS_MISSING, ros_is_missing
-from backlash_ros.tools.bringup.supervisor import Child, child_environment, foreign_environment
-from backlash_ros.tools.cli import BrokenOffError, InputError, number_of_samples, print_warnings
+from backlash_ros.tools import cli
+from backlash_ros.tools.bringup.supervisor import Child
+from backlash_ros.tools.cli import BrokenOffError, InputError
 from backlash_ros.tools.config import read_configuration, write_config
 from backlash_ros.tools.runs.files import BAG, CONFIG_FILE, result_directory
 
 ELSEWHERE = 'none'  # the parameter driver where somebody else starts it
+START_DEADLINE_S = 30.0  # for the start of every process, and for the first sample
 
 
-class AxisPlan(NamedTuple):
-    """One controller of a run, its parameters complete and checked; name: also its namespace.
+def complain(message: str, name: str = 'bringup: ') -> None:
+    print(f'{name}{message}', file=sys.stderr, flush=True)
 
-    Of the parameters, samples is 0 without end, and driver empty for the simulated plant.
+
+@dataclass
+class Axis:
+    """One controller of a run, and how far it has come; name: also its namespace.
+
+    Its parameters are complete and checked: samples is 0 without end, driver empty for the
+    simulated plant. made: samples since number first. began, moved, next_line: on the monotonic
+    clock [s]. published: samples and messages by topic of a simulated plant that is done; heard:
+    those of them that the recorder has.
     """
 
     name: str
     parameters: Parameters
     out: Path
-    record: bool
+    made: int = 0
+    first: int = 0
+    began: float = field(default_factory=time.monotonic)
+    moved: float = field(default_factory=time.monotonic)
+    next_line: float = 0.0
+    published: Mapping[str, int] | None = None
+    heard: Mapping[str, int] = field(default_factory=dict)
+    silent: bool = False
 
     @property
     def logs(self) -> Path:
         return self.out / 'logs'
-
-    @property
-    def waits(self) -> bool:
-        """Whether it waits for somebody who may come at any time."""
-        p = self.parameters
-        return p.driver == ELSEWHERE or not p.autostart or bool(p.joints)
 
     def titled(self, text: str) -> str:
         return f'{self.name}: {text}' if self.name else text
@@ -46,12 +61,76 @@ class AxisPlan(NamedTuple):
     def process_name(self, node: str) -> str:
         return f'{self.name}/{node}' if self.name else node
 
+    @property
+    def complete(self) -> bool:
+        """Whether all samples were made; a driver does not say so, the recorder hears it."""
+        p = self.parameters
+        return 0 < p.samples <= self.made if p.driver else self.published is not None
+
+    @property
+    def unheard(self) -> dict[str, int]:
+        return Counter(self.published or {}) - Counter(self.heard)
+
+    def take(self, progress: Mapping[str, Any]) -> None:
+        sample, p, now = progress['sample'], self.parameters, time.monotonic()
+        if self.made == 0:
+            # A driver may have been running before; a simulated plant begins with sample 0.
+            self.began, self.first = now, sample if p.driver else 0
+        made = sample + 1 - self.first
+        self.heard = {'samples': made, **progress.get('received', {})}
+        if made <= self.made:
+            return
+        self.made, self.moved, self.silent = made, now, False
+        if now >= self.next_line:
+            # Every 2 s, and ever more seldom, so that a run of days does not fill the disk.
+            self.next_line = now + max(2.0, 0.05 * (now - self.began))
+            words = [f'{made * p.sample_period:7.2f} s', f'{made}/{p.samples or "∞"}', *(
+                f'{name} {cli.number(progress.get(name))}' for name in topics.BACKLASH
+            ), f'lost {progress.get("lost", 0)}']
+            complain(self.titled('  '.join(words)), '')
+
+    def check_pace(self, unready: Sequence[Child] = ()) -> None:
+        """Raise BrokenOffError if it stands still; unready: its processes that are not ready."""
+        p = self.parameters
+        # A driver elsewhere, somebody who activates it or plans the motion may come at any time.
+        waits = p.driver == ELSEWHERE or (unready and (not p.autostart or p.joints))
+        # A plant of long periods may take its time.
+        patience = 10.0 + 2.0 * p.sample_period if self.made else START_DEADLINE_S
+        if self.complete or self.silent or time.monotonic() < self.moved + patience \
+                or (waits and not self.made):
+            return
+        if unready:
+            hint = ' (a controller waits until the driver subscribes to its command)' \
+                if p.driver else ''
+            raise BrokenOffError('\n'.join([
+                f'not ready within {patience:g} s: '
+                f'{", ".join(child.name for child in unready)}{hint}',
+                *(f'the end of {child.end_of_log()}' for child in unready)]))
+        at = f' after sample {self.first + self.made - 1}' if self.made else ''
+        silence = self.titled(f'no new sample for {patience:g} s{at}')
+        if not (p.driver and self.made):
+            cure = ': does the driver publish its output? Where it needs longer, start it ' \
+                   'yourself (--driver none)' if p.driver else ''
+            raise BrokenOffError(f'{silence}{cure}, see {self.logs}')
+        # The controller knows what to do when a real plant falls silent.
+        self.silent = True
+        complain(f'{silence}, waiting for the driver')
+
 
 class RunPlan(NamedTuple):
     """The controllers of a run. live_port: of the page in the browser, 0 for a free one."""
 
-    axes: tuple[AxisPlan, ...]
+    axes: Sequence[Axis]
+    record: bool = True
     live_port: int | None = None
+
+    @property
+    def stop_times(self) -> tuple[float, float]:
+        """How long to wait after the end of a stage, and beyond the usual time for an end [s]."""
+        parameters = [axis.parameters for axis in self.axes]
+        # The last command of a controller acts from the next sample of its driver on.
+        settling = max(2.0 * p.sample_period * bool(p.driver) for p in parameters)
+        return min(settling, 1.0), max(p.timeout.ramp for p in parameters)
 
 
 def prepare(options: argparse.Namespace) -> RunPlan:
@@ -80,16 +159,17 @@ def prepare(options: argparse.Namespace) -> RunPlan:
             raise InputError(f'--out={options.out}: holds a bag already, choose another folder')
     if options.unlimited and not any(p.driver for p in parameters.values()):
         raise InputError('--unlimited is about a driver: give --driver as well')
-    for name, p in parameters.items():
-        for joint in p.joint_names:
-            print_warnings(': '.join(filter(None, ('bringup', name, joint))), p.of_joint(joint))
     # The nodes need a path that holds wherever it is read.
     out = result_directory(options.out).resolve()
-    axes = tuple(AxisPlan(name, p, out / name, options.record) for name, p in parameters.items())
+    axes = [Axis(name, p, out / name) for name, p in parameters.items()]
     for axis in axes:
+        for joint in axis.parameters.joint_names:
+            cli.print_warnings(': '.join(filter(None, ('bringup', axis.name, joint))),
+                               axis.parameters.of_joint(joint))
         axis.logs.mkdir(parents=True, exist_ok=True)
         write_config(axis.parameters, axis.out / CONFIG_FILE)
-    return RunPlan(axes, 0 if options.live and not options.live_port else options.live_port)
+    live = options.live or options.live_port is not None
+    return RunPlan(axes, options.record, options.live_port or 0 if live else None)
 
 
 def _checked(p: Parameters, axis: str, options: argparse.Namespace) -> Parameters:
@@ -97,7 +177,7 @@ def _checked(p: Parameters, axis: str, options: argparse.Namespace) -> Parameter
     driver = (p.driver if options.driver is None else options.driver).strip()
     p = p.replaced({
         'lockstep': options.lockstep or p.lockstep, 'driver': driver.replace('{axis}', axis),
-        'samples': 0 if options.duration == inf else number_of_samples(p, options.duration)})
+        'samples': 0 if options.duration == inf else cli.number_of_samples(p, options.duration)})
     try:
         shlex.split(driver)
     except ValueError as error:
@@ -128,14 +208,14 @@ def _checked(p: Parameters, axis: str, options: argparse.Namespace) -> Parameter
     return p
 
 
-def plan_processes(plan: RunPlan, domain: int | None) -> list[list[Child]]:
+def plan_processes(plan: RunPlan) -> list[list[Child]]:
     """The processes of a run by stages, which are to be stopped one after the other.
 
     A simulated plant stops first, so that no output stays without its answer. With a driver the
     controller goes first and the driver hears its last command. The recorder goes last.
     """
     stages: list[list[Child]] = [[], [], [], []]
-    served: dict[str, list[AxisPlan]] = {}
+    served: dict[str, list[Axis]] = {}
     for axis in plan.axes:
         p = axis.parameters
         order = ('plant', 'reference', 'controller', 'recorder')
@@ -143,42 +223,32 @@ def plan_processes(plan: RunPlan, domain: int | None) -> list[list[Child]]:
             order = ('controller', '', '' if p.joints else 'reference', 'recorder')
         for stage, node in zip(stages, order, strict=True):
             if node:
-                stage.append(_child(axis, node, _arguments(axis, node), domain,
-                                    p.timeout.ramp if node == 'controller' else 0.0))
+                stage.append(_node(axis, node, *_arguments(axis, node, plan.record)))
         if p.driver and p.driver != ELSEWHERE:
             served.setdefault(p.driver, []).append(axis)
     for command, axes in served.items():
-        name, logs = axes[0].process_name('driver'), axes[0].logs
-        if len(axes) > 1:
-            name = f'driver of {", ".join(axis.name for axis in axes)}'
+        name = axes[0].process_name('driver') if len(axes) == 1 else \
+            f'driver of {", ".join(axis.name for axis in axes)}'
         stages[1].append(Child(
-            name, tuple(shlex.split(command)), logs / 'driver.log',
-            foreign_environment(child_environment(logs, domain)), foreign=True,
-            # The last command of the controller acts from the next sample of the driver on.
-            settle_s=min(2.0 * max(axis.parameters.sample_period for axis in axes), 1.0)))
+            name, shlex.split(command), axes[0].logs / 'driver.log', foreign=True))
     if plan.live_port is not None:
         shown = [f'/{axis.name}' if axis.name else '/controller' for axis in plan.axes]
-        stages[-1].append(_child(plan.axes[0], 'live', ['--port', str(plan.live_port), *shown],
-                                 domain))
+        stages[-1].append(_node(plan.axes[0], 'live', '--port', str(plan.live_port), *shown))
     return stages
 
 
-def _child(
-    axis: AxisPlan, node: str, arguments: Sequence[str], domain: int | None, grace_s: float = 0.0,
-) -> Child:
-    live = node == 'live'  # one for all axes
-    return Child(
-        node if live else axis.process_name(node),
-        (sys.executable, '-m', f'backlash_ros.nodes.{node}', *arguments),
-        axis.logs / f'{node}.log', child_environment(axis.logs, domain), axis.name,
-        spectator=live, grace_s=grace_s)
+def _node(axis: Axis, node: str, *arguments: str) -> Child:
+    of_all = node == 'live'  # the page of all axes
+    return Child(node if of_all else axis.process_name(node),
+                 (sys.executable, '-m', f'backlash_ros.nodes.{node}', *arguments),
+                 axis.logs / f'{node}.log', axis.name, spectator=of_all)
 
 
-def _arguments(axis: AxisPlan, node: str) -> list[str]:
+def _arguments(axis: Axis, node: str, record: bool) -> list[str]:
     lockstep = axis.parameters.lockstep
     if node == 'recorder':
         # In YAML, whatever stands in the path.
-        bag = str(axis.out / BAG).replace("'", "''") if axis.record else ''
+        bag = str(axis.out / BAG).replace("'", "''") if record else ''
         settings = ['-p', 'wait_for_publishers:=true', '-p', f"bag:='{bag}'"]
     else:
         # The loop and the recorder; in real time the reference follows plant_output as well, in

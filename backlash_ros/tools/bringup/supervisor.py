@@ -11,7 +11,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from itertools import chain
@@ -26,7 +26,6 @@ from backlash_ros.tools.cli import ONE_THREAD, BrokenOffError
 
 # SIGINT lets a node end as by Ctrl-C; a recorder may need a while to close a large bag.
 ESCALATION = ((signal.SIGINT, 10.0), (signal.SIGTERM, 3.0), (signal.SIGKILL, 3.0))
-Events = list[tuple['Child', dict[str, Any]]]
 
 
 def child_environment(log_folder: Path, domain: int | None) -> dict[str, str]:
@@ -85,27 +84,21 @@ def free_domain() -> Iterator[int]:
 
 @dataclass(eq=False)
 class Child:
-    """A process, from plan to end. axis: that its events are about.
+    """A process; axis: that its events are about.
 
-    foreign: no node of this package, which tells nothing but by its log. spectator: the run goes on
-    without it, once it is gone. settle_s: passes before it is stopped. grace_s: beyond the usual
-    time for its end. ready: it has said so.
+    foreign: no node of this package, which tells nothing but by its log. spectator: once it is
+    ready, the run goes on without it.
     """
 
     name: str
-    command: tuple[str, ...]
+    command: Sequence[str]
     log: Path
-    environment: Mapping[str, str]
     axis: str = ''
     foreign: bool = False
     spectator: bool = False
-    settle_s: float = 0.0
-    grace_s: float = 0.0
-    ready: bool = False
-    gone: bool = False
     process: subprocess.Popen[bytes] = field(init=False)
 
-    def start(self) -> None:
+    def start(self, environment: Mapping[str, str]) -> None:
         """Raises BrokenOffError for a program that cannot be started."""
         # A node lets them through when it knows what to do with them: see nodes/__init__.py.
         held_back = () if self.foreign else (signal.SIGINT, signal.SIGTERM)
@@ -113,8 +106,9 @@ class Child:
         try:
             with self.log.open('ab') as log:
                 self.process = subprocess.Popen(
-                    self.command, stdin=subprocess.DEVNULL, stderr=log, env=self.environment,
-                    stdout=log if self.foreign else subprocess.PIPE, start_new_session=True)
+                    self.command, stdin=subprocess.DEVNULL, stderr=log, start_new_session=True,
+                    stdout=log if self.foreign else subprocess.PIPE,
+                    env=foreign_environment(environment) if self.foreign else environment)
         except OSError as error:
             raise BrokenOffError(f'{self.name} does not start: {self.command[0]}: '
                                  f'{error.strerror}') from error
@@ -122,15 +116,13 @@ class Child:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def pass_on(self, events: 'SimpleQueue[tuple[Child, dict[str, Any]]]') -> None:
-        """Read its output: JSON objects with `event` are passed on, all else is logged."""
+        """Read its output: the events of nodes/runtime/process.py go on, all else is logged."""
         assert self.process.stdout is not None
         with self.process.stdout as lines, self.log.open('ab', 0) as log:
             for line in lines:
-                content = None
-                with suppress(ValueError):
-                    content = json.loads(line)
-                if isinstance(content, dict) and 'event' in content:
-                    events.put((self, content))
+                # Whoever is killed may leave half a line.
+                if line.startswith(b'{"event": ') and line.endswith(b'}\n'):
+                    events.put((self, json.loads(line)))
                 else:
                     log.write(line)
 
@@ -149,30 +141,35 @@ class ProcessSupervisor:
     """Starts processes as a context manager and has stopped all of them when it is left.
 
     stages: in the order in which they are to be stopped. hurry: whether nobody gets any more time.
+    pause_s: after the end of a stage. grace_s: beyond the usual time for an end.
     """
 
-    def __init__(self, stages: Sequence[Sequence[Child]], hurry: Callable[[], bool]) -> None:
-        self._stages, self._hurry = stages, hurry
+    def __init__(
+        self, stages: Sequence[Sequence[Child]], environment: Mapping[str, str],
+        hurry: Callable[[], bool] = lambda: False, pause_s: float = 0.0, grace_s: float = 0.0,
+    ) -> None:
+        self._stages, self._environment, self._hurry = stages, environment, hurry
+        self._times = pause_s, grace_s
         self.children: list[Child] = []
         self._readers: list[Thread] = []
         self._events = SimpleQueue[tuple[Child, dict[str, Any]]]()
 
     def __enter__(self) -> 'ProcessSupervisor':
         self._guardian = subprocess.Popen(
-            (sys.executable, '-m', 'backlash_ros.tools.bringup.supervisor'), bufsize=0,
-            stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, env=with_source(os.environ),
-            start_new_session=True)
+            (sys.executable, '-m', __name__), bufsize=0, stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL, env=with_source(os.environ), start_new_session=True)
         assert self._guardian.stdin is not None
         try:
             for child in chain(*self._stages):
-                child.start()
+                child.start(self._environment)
                 self.children.append(child)
                 with suppress(BrokenPipeError):
-                    self._guardian.stdin.write(f'{json.dumps(self._to_stop())}\n'.encode())
+                    self._guardian.stdin.write(
+                        f'{json.dumps([self._groups(), *self._times])}\n'.encode())
                 if not child.foreign:
-                    reader = Thread(target=child.pass_on, args=(self._events,), daemon=True)
-                    self._readers.append(reader)
-                    reader.start()
+                    self._readers.append(
+                        Thread(target=child.pass_on, args=(self._events,), daemon=True))
+                    self._readers[-1].start()
         except BaseException:
             self.__exit__()
             raise
@@ -180,48 +177,48 @@ class ProcessSupervisor:
 
     def __exit__(self, *error: object) -> None:
         self.stop()
-        self._guardian.communicate(b'[]\n')
+        self._guardian.communicate()
 
-    def events(self, timeout: float) -> Events:
+    def events(self, timeout: float) -> Iterator[tuple[Child, dict[str, Any]]]:
         """What the processes have said; waits up to timeout [s] for a first word."""
-        found: Events = []
         with suppress(Empty):
-            found.append(self._events.get(timeout=timeout))
+            yield self._events.get(timeout=timeout)
             while True:
-                found.append(self._events.get_nowait())
-        return found
+                yield self._events.get_nowait()
 
-    def stop(self) -> Events:
-        """Stop one stage after the other, each child with all its group; returns last words."""
-        for stage in self._to_stop():
-            stop_groups(*stage, self._hurry)
+    def stop(self) -> None:
+        """Stop one stage after the other, each child with all its group."""
+        stop_stages(self._groups(), *self._times, self._hurry)
         for child in self.children:
             child.process.poll()
         for reader in self._readers:
             reader.join(1.0)  # whoever left the group may keep the output open
-        return self.events(0.0)
 
-    def _to_stop(self) -> list[tuple[list[int], float, float]]:
-        """Of each stage its process groups, and the longest settle_s and grace_s."""
-        return [([child.process.pid for child in stage if child in self.children],
-                 max((child.settle_s for child in stage), default=0.0),
-                 max((child.grace_s for child in stage), default=0.0)) for stage in self._stages]
+    def _groups(self) -> list[list[int]]:
+        """The process groups of each stage, as far as they have been started."""
+        return [[child.process.pid for child in stage if child in self.children]
+                for stage in self._stages]
 
 
-def stop_groups(
-    groups: Sequence[int], settle_s: float, grace_s: float, hurry: Callable[[], bool],
+def stop_stages(
+    stages: Sequence[Sequence[int]], pause_s: float, grace_s: float,
+    hurry: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Signal process groups, ever more firmly, until none is alive; hurry: skip to SIGKILL."""
-    (first, usual_s), *others = ESCALATION
-    # The signal 0 is none.
-    for number, patience_s in ((0, settle_s), (first, usual_s + grace_s), *others):
-        deadline, last = time.monotonic() + patience_s, number == signal.SIGKILL
-        if last or not hurry():
-            for group in living(groups):
-                with suppress(ProcessLookupError, PermissionError):
-                    os.killpg(group, number)
-        while (last or not hurry()) and time.monotonic() < deadline and living(groups):
-            time.sleep(0.02)
+    """Signal process groups, stage by stage and ever more firmly, until none is alive.
+
+    hurry: skip to SIGKILL. The rest as in ProcessSupervisor.
+    """
+    for groups in filter(living, stages):
+        for number, patience_s in ESCALATION:
+            last = number == signal.SIGKILL
+            deadline = time.monotonic() + patience_s + grace_s * (number == signal.SIGINT)
+            if last or not hurry():
+                for group in living(groups):
+                    with suppress(ProcessLookupError, PermissionError):
+                        os.killpg(group, number)
+            while (last or not hurry()) and time.monotonic() < deadline and living(groups):
+                time.sleep(0.02)
+        time.sleep(pause_s)
 
 
 def living(groups: Sequence[int]) -> set[int]:
@@ -238,16 +235,14 @@ def living(groups: Sequence[int]) -> set[int]:
     return found.intersection(groups)
 
 
-def guard(lines: Iterable[str]) -> None:
-    """Stop what stays, stage by stage as the last line says, once the supervisor has gone."""
+def guard() -> None:
+    """Stop what the last line of stdin names, once the supervisor has gone."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
-    stages: Sequence[tuple[Sequence[int], float, float]] = []
-    for line in lines:
-        stages = json.loads(line)
-    for stage in stages:
-        stop_groups(*stage, lambda: False)
+    lines = sys.stdin.read().splitlines()
+    if lines:
+        stop_stages(*json.loads(lines[-1]))
 
 
 if __name__ == '__main__':
-    guard(sys.stdin)
+    guard()

@@ -35,14 +35,6 @@ def test_a_process_ends_though_the_interpreter_is_locked() -> None:
     assert (done.returncode, done.stdout) == (3, 'all that was to be said\n'), done.stderr
 
 
-def test_a_signal_while_bringup_is_loaded_ends_it_in_one_line() -> None:
-    program = (
-        'import os, signal, sys; sys.argv = ["bringup"]; import backlash_ros.tools.bringup;'
-        'os.kill(os.getpid(), signal.SIGINT)')
-    done = subprocess.run((sys.executable, '-c', program), capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (1, 'bringup: interrupted\n')
-
-
 def test_a_ctrl_c_that_comes_twice_at_once_counts_once() -> None:
     with StopRequests() as requests:
         for _ in range(3):

@@ -11,10 +11,11 @@ from pathlib import Path
 import pytest
 from bringup_processes import DEADLINE_S, MARK, marked_processes, wait_until
 
+from backlash_ros.tools.bringup import plan as planning
 from backlash_ros.tools.bringup import supervisor as supervising
-from backlash_ros.tools.bringup import watch as watching
-from backlash_ros.tools.bringup.plan import AxisPlan, RunPlan
+from backlash_ros.tools.bringup.plan import Axis, RunPlan
 from backlash_ros.tools.bringup.supervisor import Child, ProcessSupervisor, child_environment
+from backlash_ros.tools.bringup.watch import RunWatch
 from backlash_ros.tools.cli import StopRequests
 from backlash_ros.tools.config import effective_parameters
 
@@ -52,15 +53,14 @@ def watch(
     monkeypatch.setenv(MARK, mark)
     def watch_programs(hurry: bool = False, **programs: str) -> Watched:
         parameters = effective_parameters(None).replaced({'samples': 100})
-        axis = AxisPlan('', parameters, tmp_path, record=False)
+        axis = Axis('', parameters, tmp_path)
         axis.logs.mkdir()
         stages = [
-            [Child(
-                name, (sys.executable, '-c', program), axis.logs / f'{name}.log',
-                child_environment(axis.logs, None), foreign=name == 'driver',
-            )] for name, program in programs.items()]
-        with ProcessSupervisor(stages, lambda: hurry) as supervisor:
-            run = watching.RunWatch(RunPlan((axis,)), supervisor, StopRequests())
+            [Child(name, (sys.executable, '-c', program), axis.logs / f'{name}.log',
+                   foreign=name == 'driver')] for name, program in programs.items()]
+        environment = child_environment(axis.logs, None)
+        with ProcessSupervisor(stages, environment, lambda: hurry) as supervisor:
+            run = RunWatch(RunPlan([axis]), supervisor, StopRequests())
             run.execute()
         return Watched(run.failure, capsys.readouterr().err, mark)
     yield watch_programs
@@ -71,7 +71,7 @@ def watch(
 def test_a_process_that_is_never_ready_is_named_with_the_end_of_its_log(
     watch: Callable[..., Watched], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(watching, 'START_DEADLINE_S', 5.0)
+    monkeypatch.setattr(planning, 'START_DEADLINE_S', 5.0)
     lines = 'import time; print("hello", *range(100, 130), sep="\\n", flush=True)'
     run = watch(slow=f'{lines}; time.sleep(600)', quick=f'{READY}; {WAIT}')
     assert run.failure.startswith('not ready within 5 s: slow\n')
@@ -100,11 +100,10 @@ def test_stages_end_one_after_the_other_each_with_the_time_that_it_needs(tmp_pat
     after = f'{READY}; {begun(files[1])} {WAIT}; import os; print(os.path.exists({str(gone)!r}))'
     deaf = f'{DEAF}{begun(files[2])}time.sleep(600)'
     stages = [
-        [Child(
-            str(i), (sys.executable, '-c', program), tmp_path / f'{i}.log',
-            child_environment(tmp_path, None), foreign=True, grace_s=DEADLINE_S * (i < 2),
-        )] for i, program in enumerate((patient, after, deaf))]
-    with ProcessSupervisor(stages, lambda: False) as supervisor:
+        [Child(str(i), (sys.executable, '-c', program), tmp_path / f'{i}.log', foreign=True)]
+        for i, program in enumerate((patient, after, deaf))]
+    environment = child_environment(tmp_path, None)
+    with ProcessSupervisor(stages, environment, pause_s=0.3, grace_s=1.0) as supervisor:
         wait_until(lambda: all(file.exists() for file in files), 'all programs have begun')
         supervisor.stop()
         codes = [child.process.returncode for child in supervisor.children]
