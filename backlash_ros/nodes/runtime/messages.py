@@ -9,6 +9,7 @@ import time
 from array import array
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
+from itertools import chain
 from struct import Struct, pack, unpack_from
 from typing import Any, NamedTuple
 
@@ -33,6 +34,7 @@ KEPT_QOS = QoSProfile(depth=DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # look at what is not urgent the executor goes through every event of every publisher.
 NO_EVENTS = PublisherEventCallbacks(use_default_callbacks=False)
 CDR_FLOAT64 = Struct('<xBxxd')
+LITTLE_ENDIAN = b'\x00\x01\x00\x00'
 
 
 class LabelledArrayPublisher:
@@ -132,42 +134,41 @@ class JointReader:
         self._name: tuple[str, ...] = ()
 
     def read(self, message: bytes) -> JointMessage:
-        order = '<' if message[1] & 1 else '>'
-        seconds, nanoseconds = unpack_from(order + 'iI', message, 4)
-        at = 12 + len(self._head)
-        if not self._head or message[12:at] != self._head:
-            state = deserialize_message(message, JointState)
-            self._name = tuple(state.name)
-            at = 12 + len(_head_of(state.header.frame_id, self._name))
-            self._head = message[12:at]
-        fields = []
+        if not (self._head and message[1] & 1 and message.startswith(self._head, 12)):
+            return self._read_all(message)
+        seconds, nanoseconds = unpack_from('<iI', message, 4)
+        at, fields = 12 + len(self._head), []
         for _ in range(3):
-            at += -at % 4
-            count, = unpack_from(order + 'I', message, at)
+            count, = unpack_from('<I', message, at)
             at += 4
             if count:
                 at += (4 - at) % 8  # the encoding before does not count
-            fields.append(unpack_from(f'{order}{count}d', message, at))
+            fields.append(unpack_from(f'<{count}d', message, at))
             at += 8 * count
         return JointMessage(seconds * 10**9 + nanoseconds, self._name, *fields)
+
+    def _read_all(self, message: bytes) -> JointMessage:
+        state = deserialize_message(message, JointState)
+        stamp, self._name = state.header.stamp, tuple(state.name)
+        self._head = message[12:][:len(_head_of(state.header.frame_id, self._name))]
+        fields = map(tuple, (state.position, state.velocity, state.effort))
+        return JointMessage(stamp.sec * 10**9 + stamp.nanosec, self._name, *fields)
 
 
 def joint_message(content: JointMessage) -> bytes:
     """A sensor_msgs/JointState without a frame."""
-    message = bytearray(pack('<xBxxiI', 1, *divmod(content.stamp_ns, 10**9)))
-    message += _head_of('', content.name)
-    for values in content[2:]:
-        message += bytes(-len(message) % 4) + len(values).to_bytes(4, 'little')
-        if values:
-            message += bytes((4 - len(message)) % 8) + pack(f'<{len(values)}d', *values)
-    return bytes(message)
+    head, lists = _head_of('', content.name), content[2:]
+    # As in C, which aligns as CDR does.
+    layout = ''.join(f'I{len(values)}d' if values else 'I' for values in lists)
+    return LITTLE_ENDIAN + pack(
+        f'@iI{len(head)}s{layout}', *divmod(content.stamp_ns, 10**9), head,
+        *chain.from_iterable((len(values), *values) for values in lists),
+    )
 
 
 @lru_cache(maxsize=8)
 def _head_of(frame: str, names: tuple[str, ...]) -> bytes:
-    texts = [text.encode() + b'\x00' for text in (frame, *names)]
-    parts = [len(text).to_bytes(4, 'little') + text for text in texts]
-    head = parts[0]
-    for part in len(names).to_bytes(4, 'little'), *parts[1:]:
-        head += bytes(-len(head) % 4) + part
-    return head
+    first, texts = frame.encode(), [name.encode() for name in names]
+    layout = ''.join(f'I{len(text) + 1}s' for text in texts)
+    sized = chain.from_iterable((len(text) + 1, text) for text in texts)
+    return pack(f'@I{len(first) + 1}sI{layout}0I', len(first) + 1, first, len(texts), *sized)
