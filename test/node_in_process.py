@@ -78,7 +78,7 @@ def hand_over(node: ControllerNode, y_m: float | None, output: Output | None) ->
 
 def look_for_silence(node: ControllerNode) -> None:
     untyped: Any = node
-    for loop in node.configured:
+    for loop in node.loops.loops:
         loop.heard.y_at = -1e9
     untyped._look_for_silence()
 
@@ -104,7 +104,7 @@ class Bench:
 
     @property
     def loop(self) -> ControlLoop:
-        (loop,) = self.node.configured
+        (loop,) = self.node.loops.loops
         return loop
 
     @property
@@ -119,7 +119,7 @@ class Bench:
             hand_over(
                 self.node, self._reference(0.01 * self._k),
                 Output(self.plant.measure(), self._now_ns, 0, 0, self._k))
-            for loop in self.node.configured:
+            for loop in self.node.loops.loops:
                 loop.core.refine()  # however long it takes
 
     def serve(self) -> None:

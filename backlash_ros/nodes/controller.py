@@ -22,7 +22,6 @@ from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.jobs import Executor, WorkerExecutor
 from backlash_ros.core.loop import sample_counter
 from backlash_ros.core.loop.command_history import KEPT_COMMANDS
-from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.diagnosis import Neighbours
 from backlash_ros.core.loop.joint_loops import JointLoops
 from backlash_ros.core.loop.sample_counter import Output, SampleCounter, Timing
@@ -32,7 +31,7 @@ from backlash_ros.nodes.control.publishing import StepPublisher
 from backlash_ros.nodes.control.rivals import RivalWatch
 from backlash_ros.nodes.control.services import offer_services, refuse_unfit_transitions
 from backlash_ros.nodes.runtime.driver_io import DriverIo, check_style
-from backlash_ros.nodes.runtime.messages import DEPTH, DIAGNOSTICS_PERIOD_S, KEPT_QOS
+from backlash_ros.nodes.runtime.messages import DEPTH, DIAGNOSTICS_PERIOD_S, KEPT_QOS, line_of
 from backlash_ros.nodes.runtime.process import ProcessNode, emit, run
 
 
@@ -52,33 +51,27 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
         refuse_unfit_transitions(self)
         p = self.settings
         check_style(p)
-        for joint in p.joint_names:
-            own, of_joint = p.of_joint(joint), f'{joint}: ' if joint else ''
-            assembly.build_controller(own)  # raises ParameterError before anybody is found
-            for warning in assembly.warnings_of(own, with_reference=False):
-                self.log.warning(of_joint + warning)
-            if assembly.takes_model_as_exact(own):
-                self.log.info(
-                    f'{of_joint}plant.uncertainty is 0: G is taken as exact, which no data can '
-                    'check. Where it is not, estimates are off by more than their deviations: 0.2 '
-                    'allows for time constants that are 20 % off'
-                )
         self.active = False
-        self.loops: JointLoops | None = None  # None while unconfigured
+        self._io = DriverIo(self, p)
+        # Whoever waits for the others begins with them; who does not may have been restarted.
+        counter = SampleCounter(
+            p.sample_period, from_zero=not p.lockstep and p.wait_for_subscribers > 0
+        )
+        # Raises ParameterError before anybody is found. While unconfigured they are not used.
+        self.loops = self._make_loops(counter, {
+            # In lockstep there is the simulated plant alone, which begins at 0.
+            joint: initial if isfinite(initial) and not p.lockstep else None
+            for joint in p.joint_names for initial in [p.of_joint(joint).control.initial]
+        }, Executor())
         # A fit that shared the process of the loop would hold up its commands.
         self._executor: Executor = \
             Executor() if p.lockstep else WorkerExecutor(assembly.WORKER_MODULES)
-        self._io = DriverIo(self, p)
         if not p.lockstep:
             # The first command begins with what the driver reports, even if it is not learned from.
             self._io.listen_to(self._io.topics.applied, self._on_report, KEPT_COMMANDS)
-        # Whoever waits for the others begins with them; who does not may have been restarted.
-        self._counter = SampleCounter(
-            p.sample_period, from_zero=not p.lockstep and p.wait_for_subscribers > 0
-        )
         # Lockstep: ticks of /clock [ns], references and outputs that wait for each other.
         self._waiting: tuple[deque[int], deque[float], deque[Output]] = deque(), deque(), deque()
-        self._around: tuple[Neighbours, Timing] | None = None  # at the newest look at the graph
+        self._around = Neighbours(), Timing(p.sample_period)  # at the newest look at the graph
         self._ending: Timer | None = None  # sends the commands of on_timeout
         to = self._io.topics
         self._rivals = RivalWatch(self, self._io, self._mind_rivals)
@@ -89,7 +82,10 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
             to.reference, lambda y_m, *_: self._on_reference(y_m), KEPT_QOS if p.lockstep else 1,
             polled=not p.lockstep,
         )
-        self.joints = [Joint(self, name, p.of_joint(name), self._io) for name in p.joint_names]
+        self.joints = [
+            Joint(self, name, p.of_joint(name), self._io, loop)
+            for name, loop in self.loops.by_name.items()
+        ]
         offer_services(self, self.joints)
         turns = cycle(self.joints)
 
@@ -102,6 +98,8 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
             self.create_subscription(Clock, topics.CLOCK, self._on_clock, KEPT_QOS)
         else:
             self.every(0.1, self._look_for_silence)
+        for joint in self.joints:
+            self._warn_of(joint)
         name = self.resolve_topic_name
         self.log.info(
             f'started: {name(to.output)} and {name(to.reference)} in, {name(to.control)} out'
@@ -115,24 +113,37 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
             untyped.trigger_configure()
             untyped.trigger_activate()
 
-    @property
-    def configured(self) -> list[ControlLoop]:
-        return [] if self.loops is None else list(self.loops.loops)
+    def _make_loops(
+        self, counter: SampleCounter, v: Mapping[str, float | None], executor: Executor,
+    ) -> JointLoops:
+        """Loops that begin with the estimates of before, and with v; raises ParameterError."""
+        p, io = self.settings, self._io
+        before = {joint: assembly.known_before(p.of_joint(joint)) for joint in p.joint_names}
+        return JointLoops(p, io.publish, io.driver_of, before, counter, v, executor)
+
+    def _warn_of(self, joint: Joint) -> None:
+        for warning in assembly.warnings_of(joint.p, with_reference=False):
+            self.log.warning(line_of(joint.name, warning))
+        if assembly.takes_model_as_exact(joint.p):
+            self.log.info(line_of(
+                joint.name, 'plant.uncertainty is 0: G is taken as exact, which no data can '
+                'check. Where it is not, estimates are off by more than their deviations: 0.2 '
+                'allows for time constants that are 20 % off'
+            ))
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         try:
-            before = {joint.name: assembly.known_before(joint.p) for joint in self.joints}
-            drivers = {joint.name: joint.driver for joint in self.joints}
-            self.loops = JointLoops(
-                self.settings, self._io.publish, drivers.__getitem__, before, self._counter,
-                {joint.name: joint.v for joint in self.joints}, self._executor,
-            )
+            loops = self.loops
+            v = {name: loop.v if loop.knows_v else None for name, loop in loops.by_name.items()}
+            self.loops = self._make_loops(loops.counter, v, self._executor)
         except ParameterError as error:  # rclpy itself would swallow it without a word
             self.log.error(str(error))
             return TransitionCallbackReturn.FAILURE
+        self.configured = True
         for joint in self.joints:
-            joint.loop, e = self.loops.by_name[joint.name], before[joint.name]
+            joint.loop = self.loops.by_name[joint.name]
             joint.model.publish(joint.loop, joint.p)
+            e = joint.loop.estimate
             if e.learned:
                 self.log.info(
                     f'going on with the estimates in {joint.p.estimates.file}: m={e.m:.6g}, '
@@ -141,82 +152,67 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
         return TransitionCallbackReturn.SUCCESS
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self.active = True
         self._rivals.begin(active=True)
         if self._io.topics.output in self._io.heard:
             # v goes on from the last command, but what the plant did meanwhile is unknown, and
             # that nobody was listened to is no silence of the driver.
-            for loop in self.configured:
+            for loop in self.loops.loops:
                 loop.renew(loop.estimate)
                 loop.heard.y_at = nan
-        elif self.settings.lockstep:  # simulated time hurts nobody
-            self._await_loop()
         else:
-            self.call_when(
-                lambda: self._rivals.settled and self._knows_rivals(), self._await_loop,
-                f'discovery of another controller of {self._rivals.topic} on this machine: '
-                'end that one, or set on_rival: warn',
-            )
-        self.active = True
+            to = self._io.topics
+            self.call_when(self._are_all_there, self._listen,
+                           f'{to.reference} and the listeners of {to.control}')
         return TransitionCallbackReturn.SUCCESS
 
-    def _knows_rivals(self) -> bool:
-        """Whether no controller of this machine has still to be found that may be in charge."""
-        return not self._rivals.awaited or self.settings.on_rival == 'warn'
-
-    def _await_loop(self) -> None:
-        """Listen to plant_output, which starts the loop, as soon as everybody is there."""
+    def _are_all_there(self) -> bool:
+        """Whether everybody is found that may be there: beside the driver those who hear it all."""
         lockstep, io = self.settings.lockstep, self._io
         wanted = max(self.settings.wait_for_subscribers, int(lockstep))
+        return (lockstep or self._rivals.settled) and (not wanted or (
+            io.publisher.get_subscription_count() >= wanted
+            and self._steps.listeners >= wanted - 1
+            and (self.count_publishers(io.topics.reference) > 0 if lockstep
+                 else all(isfinite(loop.heard.y_m_at) for loop in self.loops.loops))
+        ))
 
-        def all_there() -> bool:
-            # Beside the driver, those who listen want to hear everything.
-            return not wanted or (
-                io.publisher.get_subscription_count() >= wanted
-                and self._steps.listeners >= wanted - 1
-                and (self.count_publishers(io.topics.reference) > 0 if lockstep
-                     else all(isfinite(loop.heard.y_m_at) for loop in self.configured))
-            )
-
-        def listen() -> None:
-            # Whoever is activated twice before everybody is there has two that wait.
-            if io.topics.output not in io.heard:
-                self._rivals.look()
-                self._steps.look()
-                kept = sample_counter.kept_outputs(self.settings.sample_period)
-                io.listen(self._on_output, min(kept, DEPTH))
-                emit('ready')
-
-        self.call_when(
-            all_there, listen, f'{io.topics.reference} and the listeners of {io.topics.control}'
-        )
+    def _listen(self) -> None:
+        """Listen to plant_output, which starts the loop."""
+        # Whoever is activated twice before everybody is there has two that wait.
+        if self._io.topics.output not in self._io.heard:
+            self._rivals.look()
+            self._steps.look()
+            kept = sample_counter.kept_outputs(self.settings.sample_period)
+            self._io.listen(self._on_output, min(kept, DEPTH))
+            emit('ready')
 
     def on_deactivate(self, state: LifecycleState | None) -> TransitionCallbackReturn:
-        loops = self.loops
-        if self.active and loops is not None:
+        if self.active:
             self.active = False
-            if any(loop.statistics.used for loop in loops.loops):
+            if any(loop.statistics.used for loop in self.loops.loops):
                 # Before a ramp: whoever stops this process may not wait for its end.
                 for joint in self.joints:
                     joint.save()
-                loops.end(self.settings.on_stop)
-                self._send_last(loops)
+                self.loops.end(self.settings.on_stop)
+                self._send_last()
                 for joint in self.joints:
-                    joint.model.publish(loops.by_name[joint.name], joint.p, wait_s=1)
+                    joint.model.publish(joint.loop, joint.p, wait_s=1)
             self._rivals.begin(active=False)
             self._diagnose()
         return TransitionCallbackReturn.SUCCESS
 
     on_shutdown = on_deactivate
 
-    def _send_last(self, loops: JointLoops) -> None:
+    def _send_last(self) -> None:
         """Send what ends all loops; v is held where that takes too long, or SIGKILL comes next."""
         p, told, cut_short = self.settings, time.monotonic(), False
         step_s, deadline = max(p.sample_period, 1e-3), told + p.timeout.ramp
-        while loops.send_next():
+        while self.loops.send_next():
             late = time.monotonic() + step_s > deadline
             if not cut_short and (late or SIGTERM in self.signals[1:]):
                 cut_short, why = True, f'timeout.ramp={p.timeout.ramp:g} s' if late else 'SIGTERM'
-                for loop in loops.end('hold'):
+                for loop in self.loops.end('hold'):
                     if loop.v != loop.core.limits.zero:
                         self.log.warning(
                             f'v={loop.v:.6g} is held: {why} came before it reached zero'
@@ -229,80 +225,70 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
         self._io.publisher.wait_for_all_acked(Duration(nanoseconds=100_000_000))
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        for joint in self.joints:
-            if joint.loop is not None:
-                joint.loop.core.close()
-                joint.v = joint.loop.v if joint.loop.knows_v else joint.v
-            joint.loop = None
-        self.loops = None
+        self.configured = False
+        for loop in self.loops.loops:
+            loop.core.close()
         self._diagnose()
         return TransitionCallbackReturn.SUCCESS
 
     def finish(self) -> None:
         self.on_deactivate(None)
-        self._rivals.presence.socket.close()  # nobody has to wait for this node any more
         for joint in self.joints:
             joint.close()
         self._executor.close()
 
     def _on_reference(self, y_m: Mapping[str, float]) -> None:
-        if self.loops is None:
-            return
-        self.loops.take_references(y_m)
-        if self.settings.lockstep:
-            self._waiting[1].append(self.loops.by_name[''].heard.y_m)
-            self._answer_waiting()
+        if self.configured:
+            self.loops.take_references(y_m)
+            if self.settings.lockstep:
+                self._waiting[1].append(self.loops.by_name[''].heard.y_m)
+                self._answer_waiting()
 
     def _on_report(self, applied: Mapping[str, float], info: dict[str, Any], _: object) -> None:
-        if self.loops is not None:
-            for joint, v in applied.items():
-                self.loops.by_name[joint].take_applied(v, self._io.stamp_ns(info))
+        for joint, v in applied.items():
+            self.loops.by_name[joint].take_applied(v, self._io.stamp_ns(info))
 
     def _on_clock(self, message: Clock) -> None:
         self._waiting[0].append(Time.from_msg(message.clock).nanoseconds)
         self._answer_waiting()
 
     def _on_output(self, outputs: Mapping[str, Output]) -> None:
-        loops = self.loops
-        if loops is None or not self.active:
+        if not self.active:
             return
         if self.settings.lockstep:
             self._waiting[2].append(outputs[''])
             self._answer_waiting()
-        elif self._knows_rivals() or not any(loop.begins for loop in loops.loops):
-            self._io.serve_waiting()
-            steps = loops.answer(outputs)
-            turn = next(loops.turns)
-            if steps and (turn or self._steps.heard):
-                period_s = self.settings.sample_period
-                if next(iter(outputs.values())).received_ns > time.time_ns() - period_s * 1e9:
-                    # On a busy processor the driver, woken by the command, would have to wait.
-                    time.sleep(0.05 * period_s)
-                if turn:
-                    turn.core.refine()
-                self._follow_up(loops, steps)
+            return
+        self._io.serve_waiting()
+        steps = self.loops.answer(outputs)
+        turn = next(self.loops.turns)
+        if steps and (turn or self._steps.heard):
+            period_s = self.settings.sample_period
+            if next(iter(outputs.values())).received_ns > time.time_ns() - period_s * 1e9:
+                # On a busy processor the driver, woken by the command, would have to wait.
+                time.sleep(0.05 * period_s)
+            if turn:
+                turn.core.refine()
+            self._follow_up(steps)
 
     def _answer_waiting(self) -> None:
         """Lockstep: answer as soon as tick, reference and output of a sample are there."""
-        loops, (ticks, references, outputs) = self.loops, self._waiting
-        while loops is not None and self.active and all(self._waiting):
+        ticks, references, outputs = self._waiting
+        while self.active and all(self._waiting):
             # A tick is the sample: messages are not told apart by number then.
             unnumbered = outputs.popleft()._replace(sequence=sample_counter.UNNUMBERED)
             output = unnumbered._replace(stamp_ns=ticks.popleft())
-            if steps := loops.answer({'': output}, references.popleft()):
-                loops.by_name[''].core.refine()
-                self._follow_up(loops, steps)
+            if steps := self.loops.answer({'': output}, references.popleft()):
+                self.loops.by_name[''].core.refine()
+                self._follow_up(steps)
 
-    def _follow_up(self, loops: JointLoops, steps: Mapping[str, ControlStep]) -> None:
-        self._steps.publish(loops.by_name, steps)
+    def _follow_up(self, steps: Mapping[str, ControlStep]) -> None:
+        self._steps.publish(self.loops.by_name, steps)
         for joint in self.joints:
             if joint.name in steps:
-                joint.model.follow(loops.by_name[joint.name], joint.p)
+                joint.model.follow(joint.loop, joint.p)
         if news := next((joint for joint in self.joints if joint.told != joint.state), None):
             self._diagnose(news)
-
-    def is_configured(self) -> bool:
-        return self.loops is not None
 
     def check_change(self, p: Parameters) -> None:
         for joint in self.joints:
@@ -312,63 +298,59 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
         p = self.settings
         for joint in self.joints:
             joint.p = p.of_joint(joint.name)
-            if joint.loop is not None:
+            if self.configured:
                 joint.loop.take_up(joint.p)
-        if self.loops is None and p.sample_period != before.sample_period:
-            self._counter = SampleCounter(p.sample_period)
+        if p.sample_period != before.sample_period:
+            self.loops.counter = SampleCounter(p.sample_period)
         self._mind_rivals()
 
     def _mind_rivals(self) -> None:
-        to, stand_down = self._io.topics, self.settings.on_rival == 'stand_down' \
-            and any(rival.was_first for rival in self._rivals.found)
-        changing = [loop for loop in self.configured if loop.standing_down != stand_down]
+        control = self._io.topics.control
+        stand_down = self.settings.on_rival == 'stand_down' and self._rivals.any_first
+        changing = [loop for loop in self.loops.loops if loop.standing_down != stand_down]
         if changing and stand_down:
             for loop in changing:
                 loop.stand_down()
-            self._io.listen_to(to.control, self._hear_rival, 1, polled=False)
+            self._io.listen_to(control, self._hear_rival, 1, polled=False)
         elif changing:
-            self.destroy_subscription(self._io.heard.pop(to.control))
+            self.destroy_subscription(self._io.heard.pop(control))
             for loop in changing:
                 loop.resume()
         self._diagnose()
 
     def _hear_rival(self, commands: Mapping[str, float], *_: object) -> None:
-        for joint in self.joints:
-            if joint.loop is not None and joint.name in commands:
-                joint.loop.hear_other(commands[joint.name])
+        for joint, v in commands.items():
+            self.loops.by_name[joint].hear_other(v)
 
     def _look_for_silence(self) -> None:
-        loops = self.loops
-        if loops is None or not self.active:
+        if not self.active:
             return
         self._io.serve_waiting()
         for joint in self.joints:
             if 0.0 < joint.p.estimates.save_period < time.monotonic() - joint.saved_at:
                 joint.save()
-        if loops.give_up_silent():
+        if self.loops.give_up_silent():
             if self._ending is None:
                 step_s = max(self.settings.sample_period, 1e-3)
                 self._ending = self.every(step_s, self._send_next)
             self._diagnose()
 
     def _send_next(self) -> None:
-        if self._ending is not None and not (self.loops and self.active and self.loops.send_next()):
+        if self._ending is not None and not (self.active and self.loops.send_next()):
             self.destroy_timer(self._ending)
             self._ending = None
 
     def _diagnose(self, *joints: Joint) -> None:
-        rivals, loops = self._rivals, self.loops
+        # The graph and the times of messages are looked at once for all of them.
+        if not joints or joints[0] is self.joints[0]:
+            rivals = tuple(rival.name for rival in self._rivals.found)
+            self._around = (
+                neighbours_of(self, self._io, self.settings, rivals),
+                self._io.known_of(self.loops.counter.sender.timing()),
+            )
         for joint in joints or self.joints:
-            # The graph and the times of messages are looked at once for all of them.
-            if joint is self.joints[0] or self._around is None:
-                timing = Timing(self.settings.sample_period) if loops is None \
-                    else loops.counter.sender.timing()
-                found = tuple(rival.name for rival in rivals.found)
-                self._around = (
-                    neighbours_of(self, self._io, self.settings, found), self._io.known_of(timing),
-                )
             joint.told = joint.state
-            joint.diagnose(*self._around, rivals.claim, self.active)
+            joint.diagnose(*self._around, self._rivals.claim, self.active)
 
 
 main = partial(run, CONTROLLER, ControllerNode)

@@ -21,7 +21,7 @@ from backlash_ros.core.control.limits import plausible
 from backlash_ros.core.driver_check import Heard, Message
 from backlash_ros.core.identification.motion import Drive, Shape, drive_limits, strokes
 from backlash_ros.core.parameters.table import CONTROLLER
-from backlash_ros.nodes.control.rivals import Presence, identity_made_by, name_of
+from backlash_ros.nodes.control.rivals import CommandLock, name_of
 from backlash_ros.nodes.driver_graph import DriverGraph
 from backlash_ros.nodes.runtime.executor import PromptExecutor
 from backlash_ros.nodes.runtime.messages import DEPTH
@@ -53,6 +53,8 @@ class MotionNode(ProcessNode):
         self.names = {topic: self.resolve_topic_name(topic) for topic in self.heard.by_topic}
         self.graph = DriverGraph(self, self.names)
         self._driving, self._rivals = False, ''
+        self._lock = CommandLock(self.context.get_domain_id(), self.names[topics.CONTROL])
+        self._control: Publisher
 
     def tell(self) -> None:
         """Say what came of it, and set the exit code."""
@@ -100,9 +102,7 @@ class MotionNode(ProcessNode):
         driving, p = self.options.drive, self.settings
         self._hear(topics.APPLIED_CONTROL)
         if driving:
-            control = self.names[topics.CONTROL]
-            presence = Presence(self.context.get_domain_id(), control,
-                                identity_made_by(self, control, self._advertise))
+            self._control = self.create_publisher(Float64, topics.CONTROL, DEPTH)
         else:
             self._hear(topics.CONTROL)
         self._hear(topics.PLANT_OUTPUT)
@@ -121,7 +121,7 @@ class MotionNode(ProcessNode):
                 looked = now
                 self.look()
                 if driving and now > begin + settle_s:
-                    if presence.others():
+                    if not self._lock.take():
                         self._rivals = self._rivals or 'a controller of this machine'
                     self._driving = self._control.get_subscription_count() > 0
             if self._driving and now > newest + patience:
@@ -129,10 +129,6 @@ class MotionNode(ProcessNode):
                     f'nothing was heard on {self.names[topics.PLANT_OUTPUT]} for {patience:g} s'
         self.look()
         self.heard.end_ns = time.time_ns()
-
-    def _advertise(self) -> Publisher:
-        self._control: Publisher = self.create_publisher(Float64, topics.CONTROL, DEPTH)
-        return self._control
 
     def _hear(self, topic: str) -> None:
         """Subscribe the way that hears whoever publishes, whatever the QoS."""

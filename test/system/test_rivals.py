@@ -84,8 +84,7 @@ def test_the_later_controller_stands_down_until_the_first_one_has_gone_or_is_dea
         second.send(signal.SIGSTOP)
         third = stage.start('third')
         stage.run_until(
-            lambda: 'waiting for discovery of another controller of /control' in third.stderr,
-            'a word about it')
+            lambda: stage.names_as_error('third', 'standing down: another node'), 'a word about it')
         assert stage.samples('third') == 0
         second.send(signal.SIGCONT)
         stage.run_until(lambda: stage.names_as_error('third', '/second'), 'the third to tell')

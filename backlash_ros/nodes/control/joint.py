@@ -3,8 +3,7 @@
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import cache
-from math import isfinite, isnan
+from math import isnan
 from pathlib import Path
 
 from rclpy.node import Node
@@ -14,7 +13,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from backlash_ros.core.assembly import build_controller, first_guess
 from backlash_ros.core.estimates_file import save_estimate, worth_saving
 from backlash_ros.core.loop import diagnosis
-from backlash_ros.core.loop.control_loop import ControlLoop, Driver
+from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.loop_statistics import Lately
 from backlash_ros.core.loop.sample_counter import Timing
 from backlash_ros.core.parameters import NOISE, ParameterError, Parameters
@@ -22,24 +21,21 @@ from backlash_ros.core.simulation.run_record import stated_deviations
 from backlash_ros.nodes.control.publishing import ModelPublisher
 from backlash_ros.nodes.control.rivals import name_of
 from backlash_ros.nodes.runtime.driver_io import DriverIo, output_qos
-from backlash_ros.nodes.runtime.messages import DEPTH, DiagnosticsPublisher, name_of_type
+from backlash_ros.nodes.runtime.messages import DEPTH, DiagnosticsPublisher, line_of, name_of_type
 from backlash_ros.nodes.runtime.process import ProcessNode
 
 
 class Joint:
     """What the controller has of each joint; a single one is nameless.
 
-    loop: None while the node is unconfigured. v: the command that acts as far as this node can
-    know, None if it cannot. told: the state that /diagnostics has. saved_at: when estimates were
-    saved last, on the steady clock [s].
+    loop: the newest one, which is not used while the node is unconfigured. told: the state that
+    /diagnostics has. saved_at: when estimates were saved last, on the steady clock [s].
     """
 
-    def __init__(self, node: ProcessNode, name: str, p: Parameters, io: DriverIo) -> None:
-        self.name, self.p = name, p
-        self.loop: ControlLoop | None = None
-        # In lockstep there is the simulated plant alone, which begins at 0.
-        initial = p.control.initial
-        self.v = initial if isfinite(initial) and not p.lockstep else None
+    def __init__(
+        self, node: ProcessNode, name: str, p: Parameters, io: DriverIo, loop: ControlLoop,
+    ) -> None:
+        self.name, self.p, self.loop = name, p, loop
         self.model = ModelPublisher(node, name)
         self._node, self._io = node, io
         self.told: object = None
@@ -52,27 +48,13 @@ class Joint:
         self.saved_at = time.monotonic()
 
     @property
-    def driver(self) -> Driver:
-        """What its loop can ask about the driver; the simulated plant has nothing to be asked."""
-        io = self._io
-
-        @cache
-        def warn_once(text: str) -> None:
-            if not io.is_simulated:
-                self._node.log.warning(f'{self.name}: {text}' if self.name else text)
-
-        return Driver(
-            io.now_ns, lambda: io.has_reports and not io.is_simulated, io.topics.applied, warn_once
-        )
-
-    @property
     def state(self) -> object:
-        return self.loop and (self.loop.phase, self.loop.estimate.status)
+        return self.loop.phase, self.loop.estimate.status
 
     def check_change(self, p: Parameters) -> None:
-        """Raise ParameterError for values that the running loop cannot take up."""
+        """Raise ParameterError for values that cannot be taken up."""
         build_controller(p, first_guess(p))
-        if self.loop is not None and p[NOISE] != self.p[NOISE] \
+        if self._node.configured and p[NOISE] != self.p[NOISE] \
                 and NOISE not in self.loop.core.estimator.RETUNED:
             raise ParameterError(
                 NOISE, p[NOISE], f'is not taken up live by {p.estimator.law}',
@@ -81,8 +63,8 @@ class Joint:
 
     def save(self) -> Future[str] | None:
         """Begin to save the estimates, if worth it; the result says why it failed, if it did."""
-        p, estimate = self.p, self.loop.estimate if self.loop else None
-        if estimate is None or not p.estimates.file or not worth_saving(estimate):
+        p, estimate = self.p, self.loop.estimate
+        if not p.estimates.file or not worth_saving(estimate):
             return None
         self.saved_at = time.monotonic()
 
@@ -104,7 +86,7 @@ class Joint:
         """Publish what is going on to /diagnostics. claim: what the node says in each of them."""
         loop, p, io, publish = self.loop, self.p, self._io, self._diagnostics.publish
         level, finding_of = diagnosis.Level, diagnosis.Finding
-        if loop is None:
+        if not self._node.configured:
             publish(finding_of(level.OK, 'unconfigured', 'unconfigured'), claim)
             return
         values = {**values_of(loop, timing), **claim}
@@ -138,12 +120,11 @@ class Joint:
 
     def close(self) -> None:
         self._writer.shutdown()
-        if self.loop is not None:
-            said = ', '.join(
+        if self._node.configured:
+            self._node.log.info(line_of(self.name, ', '.join(
                 f'{key}: {count}' for key, count in counts_of(self.loop).items()
                 if count or key == 'samples'
-            )
-            self._node.log.info(f'{self.name}: {said}' if self.name else said)
+            )))
 
 
 def counts_of(loop: ControlLoop) -> dict[str, int]:

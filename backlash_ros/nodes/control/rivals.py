@@ -1,17 +1,14 @@
 """Who else commands the same actuator, and which of them has to stand down."""
 
+import errno
 import hashlib
 import socket
 import time
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from math import inf
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.node import Node
-from rclpy.publisher import Publisher
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from backlash_ros import topics
@@ -23,32 +20,38 @@ from backlash_ros.nodes.runtime.process import ProcessNode
 
 # Keys in /diagnostics by which controllers know each other.
 ENDPOINT, SINCE = 'endpoint of control', 'active since [ns]'
+WAITS_NS = 2**63 - 1  # in place of that time: is active after all others
 
 
-class Presence:
-    """Makes a publisher of a topic known to all of this machine; discovery may take seconds.
+class CommandLock:
+    """One process of a machine at most may command a topic, whatever discovery knows so far.
 
-    Every controller holds a Unix socket in the abstract namespace of Linux, named after domain,
-    topic and the identity of its publisher. The kernel lists these names, and takes a name back
-    with its process, however that ends.
+    It is a name in the abstract namespace of Unix sockets (Linux), made of domain and topic. The
+    kernel takes it back with the process that has it, however that ends.
     """
 
-    def __init__(self, domain: int, topic: str, identity: str) -> None:
+    def __init__(self, domain: int, topic: str) -> None:
         # A name may have 107 bytes, a topic more.
-        place = hashlib.sha256(f'{domain} {topic}'.encode()).hexdigest()[:32]
-        self._prefix, self._own = f'@backlash_ros/{place}/', identity
-        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        # Nobody else can have this identity; where sockets are forbidden, nobody is listed.
-        with suppress(OSError):
-            self.socket.bind(f'\0{self._prefix[1:]}{identity}')
+        place = hashlib.sha256(f'{domain} {topic}'.encode()).hexdigest()
+        self._name = f'\0backlash_ros/{place}'
+        self._socket: socket.socket | None = None
 
-    def others(self) -> frozenset[str]:
-        try:
-            listed = Path('/proc/net/unix').read_text().splitlines()
-        except OSError:
-            return frozenset()
-        parts = (line.rpartition(self._prefix) for line in listed)
-        return frozenset(identity for _, found, identity in parts if found) - {self._own}
+    def take(self) -> bool:
+        """Take it if it is free; returns whether this process has it."""
+        if self._socket is None:
+            self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+            try:
+                self._socket.bind(self._name)
+            except OSError as error:
+                # Where sockets are forbidden everybody has it.
+                if error.errno == errno.EADDRINUSE:
+                    self.release()
+        return self._socket is not None
+
+    def release(self) -> None:
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
 
 
 class Rival(NamedTuple):
@@ -74,11 +77,11 @@ class Rivals:
         self._claims: dict[str, tuple[int, float]] = {}
 
     def begin(self, since_ns: int, now: float) -> None:
-        self.since_ns, self._active_at = since_ns, now if since_ns else inf
+        self.since_ns, self._active_at = since_ns, now
 
     def hear(self, values: Mapping[str, str], now: float) -> None:
         identity, since = values.get(ENDPOINT, ''), values.get(SINCE, '')
-        if identity and identity != self.own and since.isdecimal():
+        if identity and since.isdecimal():
             self._claims[identity] = int(since), now
 
     def among(self, others: Mapping[str, str], now: float) -> tuple[Rival, ...]:
@@ -99,21 +102,21 @@ class Rivals:
 class RivalWatch:
     """Looks out for other publishers of the command while the node runs.
 
-    changed: called when there is something new to say. found: the rivals at the newest look.
-    awaited: controllers of this machine that were there at activation and are not found yet.
+    Of the controllers of one machine the one with the lock commands, as far as those of others let
+    it. changed: called when there is something new to say. found: the rivals at the newest look.
     """
 
     def __init__(self, node: ProcessNode, io: DriverIo, changed: Callable[[], None]) -> None:
         self.topic = node.resolve_topic_name(io.topics.control)
         self.found: tuple[Rival, ...] = ()
-        self.awaited: frozenset[str] = frozenset()
         self._node, self._changed = node, changed
-        own = identity_made_by(node, self.topic, io.advertise)
+        self._lock = CommandLock(node.context.get_domain_id(), self.topic)
         # What discovery mostly takes: a publisher that is found so soon after the node was made was
         # there before it.
-        self._rivals = Rivals(own, node.begun_at + 0.7)
-        self.presence = Presence(node.context.get_domain_id(), self.topic, own)
+        self._rivals = Rivals(self._identity_after(io.advertise), node.begun_at + 0.7)
         self._others: frozenset[str] = frozenset()
+        # The rivals, and whether any was first, as they were at the look before.
+        self._told: tuple[tuple[Rival, ...], bool] = (), False
         self._hello_until = -inf  # until then others are told at every look who was first
         self._diagnostics = node.listen(
             DiagnosticArray, topics.DIAGNOSTICS, self._hear, 100, polled=True
@@ -125,40 +128,57 @@ class RivalWatch:
         return time.monotonic() >= self._rivals.settled_at
 
     @property
+    def any_first(self) -> bool:
+        """Whether somebody else is in charge of the actuator."""
+        return self._rivals.since_ns == WAITS_NS or any(rival.was_first for rival in self.found)
+
+    @property
     def claim(self) -> dict[str, object]:
         return {ENDPOINT: self._rivals.own, SINCE: self._rivals.since_ns}
 
     def begin(self, active: bool) -> None:
-        # Of two that begin at once the one that is listed later waits for the other at least.
-        self.awaited = self.presence.others() if active else frozenset()
-        self._rivals.begin(time.time_ns() if active else 0, time.monotonic())
+        if not active:
+            self._lock.release()
+        self._rivals.begin(WAITS_NS if active else 0, time.monotonic())
         self.look()
 
     def look(self) -> None:
-        now, before, node = time.monotonic(), self.found, self._node
+        now, node = time.monotonic(), self._node
+        if self._rivals.since_ns == WAITS_NS and self._lock.take():
+            self._rivals.begin(time.time_ns(), now)
         # Counting is ten times cheaper than asking who they are.
         infos = node.get_publishers_info_by_topic(self.topic) \
             if node.count_publishers(self.topic) > 1 else []
         others = {identity_of(info): name_of(info) for info in infos}
         others.pop(self._rivals.own, None)
-        if self.awaited:
-            self.awaited = self.awaited & self.presence.others() - others.keys()
-            # Whoever has been found while it was waited for was there before.
-            self._rivals.settled_at = max(self._rivals.settled_at, now)
         if self._others != others.keys():
             self._others, self._hello_until = frozenset(others), now + 2.0
         if others:
             serve_polled(self._diagnostics)
         self.found = self._rivals.among(others, now)
-        if before and not self.found:
+        before, self._told = self._told, (self.found, self.any_first)
+        if before[0] and not self.found:
             node.log.info(f'nobody else publishes {self.topic} any more')
-        if self.found != before or (others and now < self._hello_until):
+        if self._told != before or (others and now < self._hello_until):
             self._changed()
 
     def _hear(self, message: DiagnosticArray, info: dict[str, Any]) -> None:
         for status in message.status:
             values = {each.key: each.value for each in status.values}
             self._rivals.hear(values, 1e-9 * arrival_ns(info['received_timestamp']))
+
+    def _identity_after(self, advertise: Callable[[], object]) -> str:
+        """The identity of the publisher that advertise makes; rclpy has no way to ask for it."""
+        node, own_name = self._node, self._node.get_fully_qualified_name()
+        before = {identity_of(info) for info in node.get_publishers_info_by_topic(self.topic)}
+        advertise()
+        for _ in range(10_000):
+            # A namesake that is discovered at this very moment has no name yet.
+            for info in node.get_publishers_info_by_topic(self.topic):
+                if identity_of(info) not in before and name_of(info) == own_name:
+                    return identity_of(info)
+            time.sleep(1e-3)
+        raise RuntimeError(f'the graph does not show the own publisher of {self.topic}')
 
 
 def name_of(info: TopicEndpointInfo) -> str:
@@ -171,17 +191,3 @@ def name_of(info: TopicEndpointInfo) -> str:
 def identity_of(info: TopicEndpointInfo) -> str:
     """Identity of an endpoint, one and the same for all who see it."""
     return bytes(info.endpoint_gid).hex()
-
-
-def identity_made_by(node: Node, topic: str, advertise: Callable[[], Publisher]) -> str:
-    """Identity of the publisher that advertise makes; rclpy has no way to ask for it."""
-    own_name = node.get_fully_qualified_name()
-    before = {identity_of(info) for info in node.get_publishers_info_by_topic(topic)}
-    advertise()
-    for _ in range(10_000):
-        # A namesake that is discovered at this very moment has no name yet.
-        for info in node.get_publishers_info_by_topic(topic):
-            if identity_of(info) not in before and name_of(info) == own_name:
-                return identity_of(info)
-        time.sleep(1e-3)
-    raise RuntimeError(f'the graph does not show the own publisher of {topic}')

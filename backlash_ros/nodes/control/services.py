@@ -9,9 +9,9 @@ from rclpy.node import Node
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
-from backlash_ros.core.estimates_file import worth_saving
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.nodes.control.joint import Joint
+from backlash_ros.nodes.runtime.process import ProcessNode
 
 
 def refuse_unfit_transitions(node: Node) -> None:
@@ -30,7 +30,7 @@ def refuse_unfit_transitions(node: Node) -> None:
     service.callback = checked
 
 
-def offer_services(node: Node, joints: Sequence[Joint]) -> None:
+def offer_services(node: ProcessNode, joints: Sequence[Joint]) -> None:
     """Create ~/freeze_adaptation, ~/enable_compensation, ~/reset_estimates, ~/save_estimates."""
     unconfigured = 'the controller is unconfigured: configure it first'
 
@@ -40,38 +40,35 @@ def offer_services(node: Node, joints: Sequence[Joint]) -> None:
     ) -> None:
         """Act upon all loops; the bool, and which text it is done with, is what was asked for."""
         def serve(request: Any, response: Any) -> Any:
-            loops = [joint.loop for joint in joints if joint.loop is not None]
             wanted = getattr(request, 'data', True)
-            for loop in loops:
-                act(loop, wanted)
-            response.success = bool(loops)
-            response.message = done[wanted] if loops else unconfigured
-            node.get_logger().info(response.message)
+            if node.configured:
+                for joint in joints:
+                    act(joint.loop, wanted)
+            response.success = node.configured
+            response.message = done[wanted] if node.configured else unconfigured
+            node.log.info(response.message)
             return response
 
         node.create_service(kind, name, serve)
 
     async def save(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        loops = [joint.loop for joint in joints if joint.loop is not None]
-        if not loops:
+        files = [joint.p.estimates.file for joint in joints]
+        if not node.configured:
             response.message = unconfigured
-        elif not any(joint.p.estimates.file for joint in joints):
+        elif not any(files):
             response.message = 'estimates.file is empty, so there is nowhere to save: start with ' \
                 '-p estimates.file:=PATH, or set it while unconfigured'
-        elif not any(worth_saving(loop.estimate) for loop in loops):
+        elif not (writings := [each for joint in joints if (each := joint.save())]):
             response.message = 'nothing was learned yet'
         else:
-            reasons = []
-            for writing in filter(None, [joint.save() for joint in joints]):
+            for writing in writings:
                 # The loop goes on while the disk takes its time.
                 written: Future = Future()
                 writing.add_done_callback(written.set_result)
                 await written
-                reasons.append(writing.result())
-            why = '; '.join(filter(None, reasons))
+            why = '; '.join(filter(None, [writing.result() for writing in writings]))
             response.success = not why
-            files = ', '.join(joint.p.estimates.file for joint in joints)
-            response.message = why or f'saved in {files}'
+            response.message = why or f'saved in {", ".join(files)}'
         return response
 
     offer(SetBool, '~/freeze_adaptation', lambda loop, frozen: loop.adapt(not frozen),

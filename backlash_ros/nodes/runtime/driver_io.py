@@ -3,6 +3,7 @@
 import time
 from array import array
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from math import nan
 from typing import Any, NamedTuple
 
@@ -14,6 +15,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray
 
 from backlash_ros import topics
+from backlash_ros.core.loop.control_loop import Driver
 from backlash_ros.core.loop.sample_counter import Output, Timing
 from backlash_ros.core.parameters import ParameterError, Parameters
 from backlash_ros.nodes.runtime.executor import serve_polled
@@ -22,6 +24,7 @@ from backlash_ros.nodes.runtime.messages import (
     JointMessage,
     JointReader,
     joint_message,
+    line_of,
     message_with,
     number_of,
 )
@@ -100,6 +103,16 @@ class DriverIo:
     def is_simulated(self) -> bool:
         """Whether y comes from the plant of this package: no other one tells the truth."""
         return self._node.count_publishers(topics.TRUTH) > 0
+
+    def driver_of(self, joint: str) -> Driver:
+        """What a loop can ask about its driver; the simulated plant has nothing to be asked."""
+        @cache
+        def warn_once(text: str) -> None:
+            if not self.is_simulated:
+                self._node.log.warning(line_of(joint, text))
+
+        return Driver(self.now_ns, lambda: self.has_reports and not self.is_simulated,
+                      self.topics.applied, warn_once)
 
     def now_ns(self) -> int:
         # time.time_ns() is the system clock of ROS, without the detour.

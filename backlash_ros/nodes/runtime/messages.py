@@ -62,7 +62,7 @@ class DiagnosticsPublisher:
     """Publishes the state of a node, or a part of it, to /diagnostics, and changes to the log."""
 
     def __init__(self, node: Node, hardware_id: str, part: str = '') -> None:
-        self._node, self._prefix = node, f'{part}: ' if part else ''
+        self._node, self._part = node, part
         self._publisher = node.create_publisher(
             DiagnosticArray, topics.DIAGNOSTICS, 10, event_callbacks=NO_EVENTS
         )
@@ -84,14 +84,19 @@ class DiagnosticsPublisher:
             self._log.take(finding, time.monotonic())
 
     def _write(self, level: Level, text: str) -> None:
-        log = Node.get_logger(self._node)
+        log, line = Node.get_logger(self._node), line_of(self._part, text)
         # rclpy remembers a severity for each place in the code.
         if level == Level.OK:
-            log.info(self._prefix + text)
+            log.info(line)
         elif level == Level.WARN:
-            log.warning(self._prefix + text)
+            log.warning(line)
         else:
-            log.error(self._prefix + text)
+            log.error(line)
+
+
+def line_of(joint: str, text: str) -> str:
+    """A line of the log about a joint; the only one is nameless."""
+    return f'{joint}: {text}' if joint else text
 
 
 def name_of_type(message_type: type[Any]) -> str:

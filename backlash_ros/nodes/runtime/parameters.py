@@ -29,10 +29,7 @@ class ParameterNode(Node):
 
     settings: Parameters
     reconfigurable = False  # whether all but the fixed ones may change while it is unconfigured
-
-    def is_configured(self) -> bool:
-        """Whether only live parameters may change now, of those that are not read-only."""
-        return False
+    configured = False  # whether only live ones may change now, of those that are not read-only
 
     def check_change(self, p: Parameters) -> None:
         """Raise ParameterError for values that the node cannot take up."""
@@ -90,7 +87,7 @@ class ParameterNode(Node):
                     changes += [change] * (present is None or change.value != present)
                 elif (value := check_value(entry, _given_value(change))) \
                         != check_value(entry, present):
-                    if entry.change == 'unconfigured' and self.is_configured():
+                    if entry.change == 'unconfigured' and self.configured:
                         raise ParameterError(
                             name, UNTOLD, 'is read-only while the node is configured',
                             'deactivate it and clean it up first',
