@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.plant.backlash import Backlash
 from backlash_ros.core.plant.transfer_function import Array
-from backlash_ros.core.simulation.run_record import SETTLING_TOLERANCE, RunRecord
+from backlash_ros.core.simulation.run_record import SETTLING_TOLERANCE, RunRecord, delayed_reference
 from backlash_ros.tools.cli import number
 from backlash_ros.tools.runs.summary import ERROR_WINDOW_S, ErrorCurves, Part
 from backlash_ros.topics import BACKLASH
@@ -36,9 +36,9 @@ WHOLE_RUN = Part('Whole run', slice(None))
 matplotlib.style.use(Path(__file__).with_suffix('.mplstyle'))
 
 
-def new_figure(height: float) -> Figure:
+def new_figure(height: float, **others: Any) -> Figure:
     """Figure of the common width that needs no display."""
-    return Figure(figsize=(10.0, height))
+    return Figure(figsize=(10.0, height), **others)
 
 
 def png(figure: Figure) -> bytes:
@@ -96,14 +96,13 @@ def limits(values: Sequence[Array], margin: float) -> tuple[float, float]:
 
 
 def draw_panels(
-    height: float, rows: Mapping[str, Sequence[Line]], parts: Sequence[Part] = (WHOLE_RUN,),
+    figure: Figure, rows: Mapping[str, Sequence[Line]], parts: Sequence[Part] = (WHOLE_RUN,),
     frozen_in: RunRecord | None = None, **others: Any,
-) -> tuple[Figure, NDArray[Any]]:
-    """A figure whose columns show parts of a run, and its axes, shape (rows, parts).
+) -> NDArray[Any]:
+    """Let the columns of a figure show parts of a run; returns the axes, shape (rows, parts).
 
     rows: lines by what stands at the vertical axis. frozen_in: shades its times without learning.
     """
-    figure = new_figure(height)
     grid = np.asarray(figure.subplots(len(rows), len(parts), sharex='col', squeeze=False, **others))
     for column, part in zip(grid.T, parts, strict=True):
         label(column[0], part.name)
@@ -116,14 +115,14 @@ def draw_panels(
             if frozen_in is not None:
                 frozen = frozen_in.column('status')[part.rows] >= float(Status.NOT_EXCITED)
                 shade(axes, frozen_in.column('t')[part.rows], frozen, 'frozen')
-    return figure, grid
+    return grid
 
 
 def draw_parameter_errors(
     run: RunRecord, start: Part, settling: Mapping[str, float | None],
 ) -> Figure:
     """Errors of the estimates over time, as Figure 4 of the paper, and their relative size."""
-    t, parts, tolerance = run.column('t'), (start, WHOLE_RUN), 100.0 * SETTLING_TOLERANCE
+    t, tolerance, figure = run.column('t'), 100.0 * SETTLING_TOLERANCE, new_figure(7.4)
     errors: list[Line] = []
     percents: list[Line] = []
     for name in BACKLASH:
@@ -133,9 +132,9 @@ def draw_parameter_errors(
         # Nothing is a percentage of zero, and the logarithm has no zero.
         size = np.maximum(100.0 * np.abs(error / np.where(truth == 0.0, np.nan, truth)), 1e-6)
         percents.append((t, size, hue, '', style, 1.5))
-    figure, grid = draw_panels(7.4, {
+    grid = draw_panels(figure, {
         'true minus estimated': errors, 'size of the error [% of the true value]': percents,
-    }, parts, run, sharey='row')
+    }, (start, WHOLE_RUN), run, sharey='row')
     for absolute, relative in grid.T:
         for name in BACKLASH:
             if settling[name] is not None:
@@ -159,11 +158,12 @@ def draw_estimates(run: RunRecord, recorded: RunRecord | None = None) -> Figure:
     if recorded is not None:
         names |= {'innovation [y]': 'innovation', 'status': 'status'}
         beside, prefix, wide, own = recorded, '', 'run', 'replay'
-    figure, grid = draw_panels(1.0 + 2.0 * len(names), {text: [
+    figure = new_figure(1.0 + 2.0 * len(names))
+    rows = draw_panels(figure, {text: [
         (t, beside.column(f'{prefix}{name}'), HUES['true'], wide, '-', 6.0, 0.22),
         (t, run.column(name), HUES.get(name, HUES['e']), own, '-', 1.8),
-    ] for text, name in names.items()}, frozen_in=run)
-    for axes, name in zip(grid[:, 0], BACKLASH, strict=False):
+    ] for text, name in names.items()}, frozen_in=run)[:, 0]
+    for axes, name in zip(rows, BACKLASH, strict=False):
         estimate, std = run.column(name), 2 * run.column(f'std_{name}')
         band(axes, t, estimate - std, estimate + std, HUES[name], '±2 standard deviations')
         # The first, nearly boundless uncertainty would flatten everything else: the limits are
@@ -172,14 +172,15 @@ def draw_estimates(run: RunRecord, recorded: RunRecord | None = None) -> Figure:
         label(axes, f'${HATS[name]}$ = {estimate[-1]:.6g} ± {number(std[-1], 2)} at the end')
         legend_above(axes)
     if recorded is not None:
-        grid[-1, 0].set_yticks([int(state) for state in Status], [state.word for state in Status])
+        rows[-1].set_yticks([int(state) for state in Status], [state.word for state in Status])
     return figure
 
 
 def draw_closer(run: RunRecord, values: Array, name: str, parts: Sequence[Part]) -> Figure:
     """A signal over the whole run, and beside it closer over each part."""
-    return draw_panels(
-        3.6, {name: [(run.column('t'), values, HUES['e'])]}, (WHOLE_RUN, *parts), run)[0]
+    figure, lines = new_figure(3.6), [(run.column('t'), values, HUES['e'])]
+    draw_panels(figure, {name: lines}, (WHOLE_RUN, *parts), run)
+    return figure
 
 
 def draw_hysteresis(run: RunRecord, end: Part) -> Figure:
@@ -209,12 +210,12 @@ def draw_hysteresis(run: RunRecord, end: Part) -> Figure:
     return figure
 
 
-def draw_output(run: RunRecord, end: Part, y_m: Array, delay: float, followed: bool) -> Figure:
-    """Reference, `delay` [s] late, and output: on one scale where y follows, else on their own."""
-    t, y = run.column('t'), run.column('y')
-    late = f', {delay:.4g} s late' if delay else ''
-    reference, output = (t, y_m, HUES['y_m']), (t, y, HUES['y'])
-    figure, grid = draw_panels(5.6, {
+def draw_output(run: RunRecord, end: Part, delay: int, followed: bool) -> Figure:
+    """Reference, `delay` samples late, and output: on one scale where y follows, else on two."""
+    t, y, y_m = run.column('t'), run.column('y'), delayed_reference(run, delay)
+    late = f', {delay * run.sample_period:.4g} s late' if delay else ''
+    reference, output, figure = (t, y_m, HUES['y_m']), (t, y, HUES['y']), new_figure(5.6)
+    grid = draw_panels(figure, {
         '[unit of y]': [(*reference, f'$y_m${late}', '--'), (*output, 'y')],
         'y minus reference [unit of y]': [(t, y - y_m, HUES['y'])],
     } if followed else {
@@ -226,8 +227,8 @@ def draw_output(run: RunRecord, end: Part, y_m: Array, delay: float, followed: b
 
 
 def draw_input(run: RunRecord, parts: Sequence[Part]) -> Figure:
-    t = run.column('t')
-    figure, grid = draw_panels(5.6, {
+    t, figure = run.column('t'), new_figure(5.6)
+    grid = draw_panels(figure, {
         'input of G [unit of u]': [(t, run.column('u'), HUES['u'], 'u', '-', 1.6),
                                    (t, run.column('u_d'), HUES['u_d'], '$u_d$', '--', 1.6)],
         'control v [unit of v]': [(t, run.column('v'), HUES['v'])],
@@ -239,27 +240,26 @@ def draw_input(run: RunRecord, parts: Sequence[Part]) -> Figure:
 def draw_error_curves(loops: Sequence[ErrorCurves]) -> Figure:
     """Moving RMS of the control errors (Figure 5 of the paper) and of any tracking errors."""
     colours = [HUES[name] for name in ('m', 'c_r', 'c_l', 'v', 'u_d', 'y', 'y_m', 'u')]
-    rows: dict[str, list[Line]] = {
-        f'RMS of $u - u_d$ over {ERROR_WINDOW_S} s\n[unit of u]': [],
-        f'RMS of $y - y_m$ over {ERROR_WINDOW_S} s\n[unit of y]': [],
-    }
+    rows: dict[str, list[Line]] = {}
     for i, (name, t, *errors) in enumerate(loops):
         # The curve of the loop without backlash comes to lie on that of the one that has learned.
         width = 3.4 if name == 'moving_horizon, tracking' else 1.7
-        for lines, error in zip(rows.values(), errors, strict=True):
+        look = colours[i % 8], name, ('-', '--', '-.', ':')[i % 4], width
+        for error, what, unit in zip(errors, ('u - u_d', 'y - y_m'), 'uy', strict=True):
             if error is not None:
-                lines.append((t, error, colours[i % 8], name, ('-', '--', '-.', ':')[i % 4], width))
-    rows = {name: lines for name, lines in rows.items() if lines}
-    figure, grid = draw_panels(4.2 * len(rows), rows)
-    for axes, lines in zip(grid[:, 0], rows.values(), strict=True):
+                row = f'RMS of ${what}$ over {ERROR_WINDOW_S} s\n[unit of {unit}]'
+                rows.setdefault(row, []).append((t, error, *look))
+    figure = new_figure(4.2 * len(rows))
+    grid = draw_panels(figure, rows)
+    titles = 'Control error', 'Tracking error, where y is meant to follow'
+    for axes, lines, title in zip(grid[:, 0], rows.values(), titles, strict=False):
+        label(axes, title)
         known = [size[np.isfinite(size) & (size > 0.0)] for _, size, *_ in lines]
         if highest := [float(size.max()) for size in known if size.size]:
             axes.set_yscale('log')
             # An error begins at zero; a law that diverges leaves the axes.
             low, high = np.percentile(np.concatenate(known), 2), 1e3 * np.median(highest)
             axes.set_ylim(0.6 * float(low), 1.7 * min(max(highest), float(high)))
-    label(grid[0, 0], 'Control error')
-    label(grid[-1, 0], 'Tracking error, where y is meant to follow' if len(rows) > 1 else '')
     legend_below(figure, grid[0, 0])
     return figure
 

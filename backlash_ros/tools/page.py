@@ -7,6 +7,8 @@ from pathlib import Path
 from string import Template
 from typing import NamedTuple
 
+from backlash_ros.atomic_file import write_atomically
+
 
 class Picture(NamedTuple):
     """A figure of a page: name of its PNG file, heading, what to see in it (HTML)."""
@@ -17,13 +19,17 @@ class Picture(NamedTuple):
     data: bytes
 
 
-def page(
-    title: str, lead: str, warnings: Sequence[str], parts: Sequence[str],
+def write_page(
+    path: Path, title: str, lead: str, warnings: Sequence[str], parts: Sequence[str],
     pictures: Sequence[Picture], folded: tuple[str, str] | None = None,
-) -> str:
-    """A page as text; lead and parts are HTML; folded: heading and text of a last section."""
+) -> None:
+    """Write a page, and its pictures beside it as well.
+
+    lead, parts: HTML. folded: heading and text of a last section.
+    """
     sections = list(parts)
-    for _, name, caption, data in pictures:
+    for file, name, caption, data in pictures:
+        write_atomically(path.with_name(file), data)
         heading, coded = escape(name), base64.b64encode(data).decode('ascii')
         sections.append(f'<h2>{heading}</h2>\n<p>{caption}</p>\n'
                         f'<img alt="{heading}" src="data:image/png;base64,{coded}">')
@@ -31,9 +37,9 @@ def page(
         summary, text = map(escape, folded)
         sections.append(f'<details><summary>{summary}</summary><pre>{text}</pre></details>')
     template = Template(Path(__file__).with_suffix('.html').read_text(encoding='utf-8'))
-    return template.substitute(title=escape(title), lead=lead, content='\n'.join([
+    write_atomically(path, template.substitute(title=escape(title), lead=lead, content='\n'.join([
         *(f'<p class="warning">{escape(warning)}</p>' for warning in warnings),
-        *(f'<section>\n{section}\n</section>' for section in sections)]))
+        *(f'<section>\n{section}\n</section>' for section in sections)])))
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -18,7 +18,7 @@ from backlash_ros.tools import cli, figures
 from backlash_ros.tools.cli import NOTHING, number
 from backlash_ros.tools.config import config_text
 from backlash_ros.tools.figures import png
-from backlash_ros.tools.page import Picture, page, table
+from backlash_ros.tools.page import Picture, table, write_page
 from backlash_ros.tools.records.reading import read_run_or_log
 from backlash_ros.tools.runs import files
 from backlash_ros.tools.runs import summary as told
@@ -46,12 +46,10 @@ def write_report(run: files.Run, out: Path) -> dict[str, Any]:
     if run.parameters is not None:
         folded = 'Parameters of this run', config_text(run.parameters)
         write_atomically(out / files.CONFIG_FILE, folded[1])
-    pictures = list(_figures(run.record, run.parameters, summary))
-    for picture in pictures:
-        write_atomically(out / picture.name, picture.data)
-    write_atomically(out / REPORT_PAGE, page(
-        'Adaptive backlash inverse control', headline(summary), [f'{note}.' for note in notes],
-        [_tables(summary)], pictures, folded))
+    write_page(
+        out / REPORT_PAGE, 'Adaptive backlash inverse control', headline(summary),
+        [f'{note}.' for note in notes], [_tables(summary)],
+        list(_figures(run.record, run.parameters, summary)), folded)
     return summary
 
 
@@ -67,7 +65,8 @@ def _figures(
     curves, notes = told.compare_laws(run, parameters) if truth and parameters else ([], [])
     known = np.isfinite(error).any()
     duration = min(float(run.column('t')[-1]) + run.sample_period, 1e4 * run.sample_period)
-    y_m, delay, followed = told.followed_reference(run, parameters)
+    off = summary['tracking_error_rms']
+    followed = off is not None and off < 0.5  # of the RMS of the reference
     for wanted, name, heading, caption, draw, *arguments in (
         (truth, 'parameter_errors', 'Parameter errors over time (Figure 4 of the paper)',
          'How far the estimates are from the hidden backlash, and in percent of it. A dot marks '
@@ -93,7 +92,7 @@ def _figures(
         (True, 'output', 'Reference and output', 'y follows y<sub>m</sub>.' if followed else
          'Each on its own scale: y does not follow y<sub>m</sub>, nor does the structure '
          'u<sub>d</sub> = y<sub>m</sub> + f v aim at that.',
-         figures.draw_output, end, y_m, delay, followed),
+         figures.draw_output, end, told.reference_delay(parameters), followed),
         (True, 'input', 'Desired input and control', 'v jumps by the width of the gap whenever '
          'u<sub>d</sub> turns.', figures.draw_input, parts),
     ):

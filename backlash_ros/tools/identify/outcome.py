@@ -21,7 +21,7 @@ from backlash_ros.core.parameters import BRINGUP, BY_NAME, PLANT, ParameterError
 from backlash_ros.core.records.record import Record
 from backlash_ros.tools.cli import BrokenOffError, format_table
 from backlash_ros.tools.config import ANY, config_text
-from backlash_ros.tools.page import page, table
+from backlash_ros.tools.page import table, write_page
 from backlash_ros.tools.records.columns import COMMAND, ROLES
 from backlash_ros.tools.runs.files import result_directory, write_summary, write_table
 
@@ -64,10 +64,6 @@ def write_outcome(
     signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT,))
     from backlash_ros.tools.identify.pictures import pictures
     signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT,))
-    drawn = list(pictures(found))
-    for picture in drawn:
-        write_atomically(out / picture.name, picture.data)
-
     known = found.verdict is not None and found.verdict.backlash.known
     lines = found.verdict.lines if found.verdict else ()
     refused = [f'no {YAML}: {found.refused}'] if found.refused else []
@@ -75,12 +71,12 @@ def write_outcome(
     constants = [(name, f'{getattr(found, name):.6g}', f'{found.std[name]:.2g}')
                  for name in ('gap', 'c_r', 'c_l', 'm') if found.std]
     head, told = ('', 'found', '±'), _facts(found, record)
-    write_atomically(out / 'identify.html', page(
-        'Identification of backlash and G(z)',
+    write_page(
+        out / 'identify.html', 'Identification of backlash and G(z)',
         f'<b>The backlash is {"" if known else "not "}known</b>: {len(found.y)} samples of '
         f'{found.sample_period:g} s from {escape(record.source)}.', [*lines, *refused, *notes],
         [table(head, constants) + table((), [(name, escape(fact)) for name, fact in told])]
-        if constants else [], drawn, None if text is None else (YAML, text)))
+        if constants else [], list(pictures(found)), None if text is None else (YAML, text))
     print('\n'.join([
         *lines, *([format_table(head, constants)] if constants else []),
         *(f'{name}: {fact}' for name, fact in told), *(f'note: {note}' for note in notes), *refused,

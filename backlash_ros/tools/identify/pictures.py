@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from backlash_ros.core.identification.identification import Details, Identification
 from backlash_ros.core.identification.model import autocorrelation
 from backlash_ros.tools import figures
-from backlash_ros.tools.figures import HUES, TIME_LABEL, curve, label
+from backlash_ros.tools.figures import HUES, curve, draw_panels, label
 from backlash_ros.tools.page import Picture
 
 BAND_STDS = 2.0  # standard deviations that bands reach
@@ -35,7 +35,7 @@ def pictures(found: Identification) -> Iterator[Picture]:
          'the dotted lines y moved; outside of them the record says little.', 5.6, _bode),
     ):
         if found.details is not None:
-            figure = Figure(figsize=(10.0, height), constrained_layout=False)
+            figure = figures.new_figure(height, constrained_layout=False)
             # Margins that suit all of them: a layout takes as long as to draw it.
             figure.subplots_adjust(left=0.1, right=0.985, bottom=0.55 / height,
                                    top=1.0 - 0.4 / height, wspace=0.2, hspace=0.4)
@@ -44,17 +44,16 @@ def pictures(found: Identification) -> Iterator[Picture]:
 
 
 def _held_out(figure: Figure, found: Identification, details: Details) -> None:
-    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[2.2, 1.0])
     first, y, simulated, rms, _ = details.held_out
     t = found.sample_period * np.arange(first, first + len(simulated), dtype=float)
-    curve(upper, t, y, HUES['y'], 'measured', width=2.2)
-    curve(upper, t, simulated, HUES['u_d'], 'simulated', '--')
+    upper, lower = draw_panels(figure, {
+        'y': [(t, y, HUES['y'], 'measured', '-', 2.2),
+              (t, simulated, HUES['u_d'], 'simulated', '--')],
+        'difference': [(t, y - simulated, HUES['e'])],
+    }, height_ratios=[2.2, 1.0])[:, 0]
+    label(upper, f'{1.0 - rms / max(float(np.nanstd(y)), 1e-300):.2%} of the motion is predicted')
     figures.legend_above(upper)
-    curve(lower, t, y - simulated, HUES['e'])
     figures.zero_line(lower)
-    share = 1.0 - rms / max(float(np.nanstd(y)), 1e-300)
-    label(upper, f'{share:.2%} of the motion is predicted', 'y')
-    label(lower, '', 'difference', TIME_LABEL)
 
 
 def _loop(figure: Figure, found: Identification, details: Details) -> None:
@@ -72,43 +71,39 @@ def _loop(figure: Figure, found: Identification, details: Details) -> None:
 
 
 def _residual(figure: Figure, found: Identification, details: Details) -> None:
-    grid = figure.add_gridspec(2, 2)
-    over_time = figure.add_subplot(grid[0, :])
-    correlated, over_v = figure.add_subplot(grid[1, 0]), figure.add_subplot(grid[1, 1])
+    over_time, correlated, over_v = figure.subplot_mosaic('tt;cv').values()
     residual = details.observed.residual
     t = found.sample_period * (details.first + np.arange(len(residual), dtype=float))
     curve(over_time, t, residual, HUES['e'], width=0.8)
-    label(over_time, f'Deviation {found.model.noise_std:.3g}', 'residual', TIME_LABEL)
+    label(over_time, f'Deviation {found.model.noise_std:.3g}', 'residual', figures.TIME_LABEL)
     bound = BAND_STDS / np.sqrt(np.isfinite(residual).sum())
     r = autocorrelation(residual, 60)[1:]
     correlated.axhspan(-bound, bound, color='#bbbbbb', alpha=0.5, linewidth=0)
     correlated.vlines(np.arange(1, len(r) + 1), 0.0, r, color=HUES['e'], linewidth=1.5)
     correlated.set_ylim(*figures.limits([np.append(r, [-3.0 * bound, 3.0 * bound])], 0.1))
-    label(correlated, 'Autocorrelation', '', 'lag [samples]')
+    label(correlated, 'Autocorrelation', x='lag [samples]')
     over_v.plot(details.v, residual, '.', color=HUES['e'], markersize=2, alpha=0.4,
                 rasterized=True)
-    label(over_v, 'Over v', '', 'v')
+    label(over_v, 'Over v', x='v')
     for axes in (over_time, correlated, over_v):
         figures.zero_line(axes)
 
 
 def _bode(figure: Figure, found: Identification, details: Details) -> None:
-    magnitude, phase = figure.subplots(2, 1, sharex=True)
     w = np.geomspace(max(found.model.frequencies[0] / 5.0, 1e-5), 0.98 * np.pi, 400)
+    f = w / (2.0 * np.pi * found.sample_period)
     value = details.response.at(w) * np.exp(-1j * w * found.model.delay)
     spread = BAND_STDS * details.response.std(w)
     size, angle = np.abs(value), np.degrees(np.unwrap(np.angle(value)))
     turn = np.degrees(np.arcsin(np.minimum(spread, 1.0)))
-    for axes, middle, low, high, name, unit in (
-        (magnitude, size, size * np.maximum(1.0 - spread, 1e-3), size * (1.0 + spread),
-         'Magnitude', '|m G| [y/v]'),
-        (phase, angle, angle - turn, angle + turn, 'Phase', 'degrees'),
-    ):
-        f = w / (2.0 * np.pi * found.sample_period)
-        figures.band(axes, f, low, high, HUES['m'])
-        curve(axes, f, middle, HUES['m'])
-        for edge in found.hertz[[0, -1]]:
+    magnitude, phase = draw_panels(figure, {
+        '|m G| [y/v]': [(f, size, HUES['m'])], 'degrees': [(f, angle, HUES['m'])]})[:, 0]
+    figures.band(magnitude, f, size * np.maximum(1.0 - spread, 1e-3), size * (1.0 + spread),
+                 HUES['m'])
+    figures.band(phase, f, angle - turn, angle + turn, HUES['m'])
+    for edge in found.hertz[[0, -1]]:
+        for axes in (magnitude, phase):
             axes.axvline(edge, color='#444444', linestyle=':', linewidth=1.0)
-        label(axes, name, unit)
-    label(phase, x='frequency [Hz]')
+    label(magnitude, 'Magnitude')
+    label(phase, 'Phase', x='frequency [Hz]')
     magnitude.set(xscale='log', yscale='log', ylim=(size.min() / 3.0, size.max() * 3.0))

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from backlash_ros.atomic_file import point_link, write_atomically
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord, from_fields
 from backlash_ros.tools.cli import InputError
 
@@ -33,7 +33,7 @@ class Run(NamedTuple):
 
     record: RunRecord
     parameters: Parameters | None
-    latency_s: NDArray[np.float64] | None = None
+    latency_s: Array | None = None
     notes: tuple[str, ...] = ()
 
 
@@ -84,12 +84,10 @@ def write_run(run: RunRecord, directory: Path) -> None:
     write_atomically(directory / RECORD_FILE, buffer.getvalue())
 
 
-def _rows_of(names: Sequence[str], cells: NDArray[np.float64]) -> NDArray[np.float64]:
-    rows = np.full((len(cells), len(COLUMNS)), np.nan)
-    for name, column in zip(names, cells.T, strict=True):
-        if name in COLUMNS:
-            rows[:, COLUMNS.index(name)] = column
-    return rows
+def rows_of(columns: Mapping[str, Array]) -> Array:
+    """Rows of a RunRecord from those of its columns, shape (N,), that are known, t among them."""
+    unknown = np.full(len(columns['t']), np.nan)
+    return np.column_stack([columns.get(name, unknown) for name in COLUMNS])
 
 
 def read_record(path: Path) -> RunRecord:
@@ -99,7 +97,7 @@ def read_record(path: Path) -> RunRecord:
             fields = {name.removeprefix('learned.'): stored[name].tolist()
                       for name in stored.files if name.startswith('learned.')}
             return RunRecord(
-                _rows_of(stored['columns'].tolist(), stored['rows']),
+                rows_of(dict(zip(stored['columns'].tolist(), stored['rows'].T, strict=True))),
                 float(stored['sample_period']), int(stored['lost_samples']),
                 from_fields(fields) if fields else None)
     except (OSError, KeyError, ValueError, IndexError, EOFError, zipfile.BadZipFile) as error:
@@ -127,4 +125,4 @@ def read_samples(path: Path, sample_period: float | None = None) -> RunRecord:
         raise InputError(f'{path}: needs two samples to tell the sample period')
     period = sample_period or float(steps.min())
     lost = max(round((t[-1] - t[0]) / period) + 1 - len(t), 0)
-    return RunRecord(_rows_of(names, cells), period, lost)
+    return RunRecord(rows_of(dict(zip(names, cells.T, strict=True))), period, lost)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 
 from backlash_ros import topics
@@ -23,8 +24,8 @@ from backlash_ros.tools.runs import files
 from backlash_ros.tools.runs.files import BAG, CONFIG_FILE, RECORD_FILE, SAMPLES_FILE, Run
 
 Messages = list[tuple[int, Any]]  # with their stamps [ns], in the order of these
-# Messages of an array topic by label, shape (N,) each, and their `stamp` [ns] since the first.
-Table = dict[str, Array]
+# Rows of an array topic: a field for each of its labels, and `stamp` [ns] since the first signals.
+Table = NDArray[np.void]
 
 
 def read_run(
@@ -147,10 +148,8 @@ def read_bag(
 
     sample_period: None takes the median distance of the stamps. Raises InputError.
     """
-    last_parts = {topic.rpartition('/')[2] for topic in topics.LABELS_OF}
     recorded, names, damage = read_topics(
-        path, lambda topic: topic.name.rpartition('/')[2] in last_parts
-        and topic.message_type == 'std_msgs/msg/Float64MultiArray')
+        path, lambda topic: topic.message_type == 'std_msgs/msg/Float64MultiArray')
     try:
         found, prefix, notes = _of_axis(recorded, names, axis)
         begin_ns = found[topics.SIGNALS][0][0]
@@ -161,36 +160,34 @@ def read_bag(
                          if begin <= stamp - begin_ns < span.to_s * 1e9]
                  for topic, messages in found.items()}
         models = found.pop(topics.MODEL)
-        tables = [_tabulate(*each, prefix) for each in found.items()]
-        restarted = _choose_section(tables)
+        tables, restarted = _last_section([_tabulate(*each, prefix) for each in found.items()])
         signals, estimates, truth = tables
-        if not signals['stamp'].size:
+        if not len(signals):
             raise InputError('holds no sample between --from and --to')
         count, of_signals, of_estimates = np.intersect1d(
             signals['sample'], estimates['sample'], assume_unique=True, return_indices=True)
-        if count.size == 0:
+        if not len(count):
             raise InputError(f'no sample has both {topics.SIGNALS} and {topics.ESTIMATES}')
         if sample_period is None:
             steps = np.diff(signals['stamp'][of_signals]) / np.diff(count)
-            sample_period = 1e-9 * float(np.median(steps)) if steps.size else 0.0
+            sample_period = 1e-9 * float(np.median(steps)) if len(steps) else 0.0
             if not sample_period > 0.0:
                 raise InputError('its stamps do not show the sample period: give --config')
             notes.append(f'the sample period of {sample_period:.6g} s was taken from the stamps of '
                          'the bag, as no parameters were given')
     except InputError as error:
         raise InputError('; '.join(filter(None, (f'{path}: {error}', damage)))) from None
-    columns = _rows(signals, of_signals) | _rows(estimates, of_estimates)
-    columns |= _true_columns(columns['v'], count, truth)
-    columns['t'] = (count - count[0]) * sample_period
     heard = np.union1d(signals['sample'], estimates['sample'])
-    if heard.size > count.size:
-        notes.append(f'{heard.size - count.size} samples were left out: only one of signals and '
-                     'estimates is in the bag')
-    unknown = np.full(count.size, np.nan)
-    record = RunRecord(
-        np.column_stack([columns.get(name, unknown) for name in COLUMNS]), sample_period,
-        int(heard[-1] - heard[0]) + 1 - heard.size, _newest_model(
-            [message for stamp, message in models if stamp >= signals['stamp'][0]], prefix))
+    if unpaired := len(heard) - len(count):
+        notes.append(f'{unpaired} samples were left out: only one of signals and estimates is in '
+                     'the bag')
+    learned = _newest_model(
+        [message for stamp, message in models if stamp >= signals['stamp'][0]], prefix)
+    signals, estimates = signals[of_signals], estimates[of_estimates]
+    columns = {'t': (count - count[0]) * sample_period, **_true_columns(signals, truth), **{
+        label: table[label] for table in (signals, estimates) for label in table.dtype.names or ()}}
+    record = RunRecord(files.rows_of(columns), sample_period,
+                       int(heard[-1] - heard[0]) + 1 - len(heard), learned)
     return Run(record, None, columns['latency_s'], tuple(filter(None, [damage, *notes, restarted])))
 
 
@@ -202,10 +199,10 @@ def _of_axis(
     prefix, notes = '', list[str]()
     labels_of = {name: _labels(messages[0][1]) for name, messages in recorded.items()}
     for topic, labels in topics.LABELS_OF.items():  # signals first
-        # Nodes that were renamed are known by their labels.
-        names = sorted(
-            name for name, given in labels_of.items() if topic_ends_like(name, topic)
-            or (name.rpartition('/')[2] == topic.rpartition('/')[2] and set(labels) <= set(given)))
+        # The nodes may have been renamed.
+        names = sorted(name for name, given in labels_of.items()
+                       if topic_ends_like(name, topic.rpartition('/')[2])
+                       and {*labels} <= {label.rpartition('.')[2] for label in given})
         if topic == topics.SIGNALS and names:
             joints = list(dict.fromkeys(
                 label.partition('.')[0] for label in labels_of[names[0]] if '.' in label))
@@ -230,57 +227,50 @@ def _labels(message: Any) -> list[str]:
 
 def _tabulate(topic: str, messages: Messages, prefix: str) -> Table:
     """The messages of a topic, of several joints what is about the one with this prefix."""
+    labels = topics.LABELS_OF[topic]
+    table = np.zeros(len(messages), [(label, float) for label in (*labels, 'stamp')])
     if not messages:  # as a real plant does not know its truth
-        return {label: np.empty(0) for label in (*topics.LABELS_OF[topic], 'stamp')}
-    given = _labels(messages[0][1]) or topics.LABELS_OF[topic]
+        return table
+    given = _labels(messages[0][1])
     if any(len(message.data) != len(given) for _, message in messages):
         raise InputError(f'{topic} has a message without a value for each label')
-    values = np.array([message.data for _, message in messages], dtype=np.float64).T
-    table = {label.removeprefix(prefix): column for label, column in zip(given, values, strict=True)
-             if label.startswith(prefix)}
-    if missing := sorted(set(topics.LABELS_OF[topic]) - set(table)):
-        raise InputError(f'{topic} lacks {", ".join(missing)}')
+    values = np.array([message.data for _, message in messages])
+    for label in labels:
+        table[label] = values[:, given.index(prefix + label)]
+    table['stamp'] = [stamp for stamp, _ in messages]
     # A joint that was not answered has a row of nan.
-    answered = ~np.isnan(list(table.values())).all(axis=0)
-    table['stamp'] = np.array([stamp for stamp, _ in messages], dtype=np.float64)
-    return _rows(table, answered if prefix else slice(None))
+    return table[~np.isnan([table[label] for label in labels]).all(axis=0)] if prefix else table
 
 
-def _rows(table: Table, chosen: Any) -> Table:
-    return {label: column[chosen] for label, column in table.items()}
-
-
-def _choose_section(tables: list[Table]) -> str:
-    """Leave in the tables the rows of the last run; what was left out in a sentence, or ''."""
+def _last_section(tables: list[Table]) -> tuple[list[Table], str]:
+    """The rows of the last run, one a sample; what was left out in a sentence, or ''."""
     signals, note = tables[0], ''
     restarts = np.flatnonzero(np.diff(signals['sample']) <= 0) + 1
     # Where the count falls back that often, two nodes are at work.
-    if restarts.size > 0.1 * signals['sample'].size:
+    if len(restarts) > 0.1 * len(signals):
         note = 'two controllers published at once: the first row of each sample is used'
-    elif restarts.size:
+    elif len(restarts):
         cut = signals['stamp'][restarts[-1]]
         note = ('the controller restarted its count: this is what follows the last restart, '
                 f'{cut * 1e-9:.1f} s after the beginning; --from and --to choose another part')
         # Signals by rows, as stamps of a simulated time may be equal.
-        tables[:] = [_rows(signals, slice(restarts[-1], None)),
-                     *(_rows(table, table['stamp'] >= cut) for table in tables[1:])]
-    tables[:] = [_rows(table, np.unique(table['sample'], return_index=True)[1]) for table in tables]
-    return note
+        tables = [signals[restarts[-1]:], *(each[each['stamp'] >= cut] for each in tables[1:])]
+    return [each[np.unique(each['sample'], return_index=True)[1]] for each in tables], note
 
 
-def _true_columns(v: Array, count: Array, truth: Table) -> Table:
+def _true_columns(signals: Table, truth: Table) -> dict[str, Array]:
     """u where it was recorded (the last v never acts), and the newest true backlash."""
-    sample = truth['sample']
-    if sample.size == 0:
+    if not len(truth):
         return {}
+    count, sample = signals['sample'], truth['sample']
     if not np.intersect1d(count, sample).size:
         # A controller that was started later counts from another beginning: the same v tells.
         sample_of = dict(zip(truth['v'].tolist(), sample.tolist(), strict=True))
-        offsets = Counter(k - sample_of[value] for k, value in zip(count, v.tolist(), strict=True)
-                          if value in sample_of)
+        offsets = Counter(k - sample_of[v] for k, v in signals[['sample', 'v']].tolist()
+                          if v in sample_of)
         sample = sample + (offsets.most_common(1) or [(0, 0)])[0][0]
     _, here, there = np.intersect1d(count, sample, assume_unique=True, return_indices=True)
-    u = np.full(count.size, np.nan)
+    u = np.full(len(count), np.nan)
     u[here] = truth['u'][there]
     newest = np.maximum(np.searchsorted(sample, count, side='right') - 1, 0)
     return {'u': u, **{f'true_{name}': truth[name][newest] for name in topics.BACKLASH}}

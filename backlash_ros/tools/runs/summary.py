@@ -1,6 +1,7 @@
 """What is told of a run: its figures of merit, the content of summary.json, and its curves."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from math import isfinite
 from typing import Any, NamedTuple
 
@@ -68,7 +69,8 @@ def summarise(
             name: run_record.settling_time(t, run.column(name), run.column(f'true_{name}'))
             if run.has_truth else None for name in BACKLASH},
         'control_error_rms': run_record.control_error_rms(run),
-        'tracking_error_rms': _following(run, parameters)[1],
+        'tracking_error_rms': run_record.delayed_tracking_error_rms(
+            run, reference_delay(parameters), float(t[run.samples // 2])),
         'loop_latency_ms': {f'p{q}': 1e3 * float(np.percentile(latency, q)) for q in (50, 99)}
         if latency.size else None,
         'final_status': words.get(newest['status']),
@@ -83,11 +85,9 @@ def summarise(
     }
 
 
-def _following(run: RunRecord, parameters: Parameters | None) -> tuple[int, float | None]:
-    """Samples by which y is to follow y_m late, 0 if unknown; relative error of the last half."""
-    delay = build_structure(parameters).delay if parameters else 0
-    half = float(run.column('t')[run.samples // 2])
-    return delay, run_record.delayed_tracking_error_rms(run, delay, half)
+def reference_delay(parameters: Parameters | None) -> int:
+    """Samples by which y is to follow y_m late, 0 where that is unknown."""
+    return build_structure(parameters).delay if parameters else 0
 
 
 def estimate_cells(summary: Mapping[str, Any], name: str) -> tuple[str, ...]:
@@ -131,23 +131,13 @@ def compare_laws(run: RunRecord, parameters: Parameters) -> tuple[list[ErrorCurv
     """
     t, own, notes = run.column('t'), parameters.estimator.law, []
     samples = min(round(float(t[-1]) / run.sample_period) + 1, 10_000)
-    compared = t < (samples - 0.5) * run.sample_period
-    curves = [ErrorCurves(f'{own} (this run)', t[compared],
-                          moving_rms(control_error(run)[compared], run.sample_period))]
+    beginning = run.rows[t < (samples - 0.5) * run.sample_period]
+    runs = {f'{own} (this run)': replace(run, rows=beginning)}
     for law in (law for law in LAWS if law != own and law_fits(law, parameters.structure)):
         try:
-            other = run_loop(build_closed_loop(parameters.replaced({
+            runs[law] = run_loop(build_closed_loop(parameters.replaced({
                 'estimator.law': law, 'estimates.load': False})), samples)
         except (ParameterError, InputError, BrokenOffError) as error:
             notes.append(f'{law}: {error}')
-            continue
-        curves.append(ErrorCurves(
-            law, other.column('t'), moving_rms(control_error(other), run.sample_period)))
-    return curves, notes
-
-
-def followed_reference(run: RunRecord, parameters: Parameters | None) -> tuple[Array, float, bool]:
-    """What y is to follow, shape (N,), how late [s], and whether one scale suits both."""
-    delay, error = _following(run, parameters)
-    close = error is not None and error < 0.5  # of the RMS of the reference
-    return run_record.delayed_reference(run, delay), delay * run.sample_period, close
+    return [ErrorCurves(name, each.column('t'), moving_rms(control_error(each), run.sample_period))
+            for name, each in runs.items()], notes
