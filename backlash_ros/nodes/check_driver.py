@@ -1,49 +1,235 @@
-"""Node that judges a driver: it listens, moves it gently if told to, and says what does not fit."""
+"""Node that judges a driver: it listens, moves it gently if told to, and says what does not fit.
+
+For `identify --drive` it moves v, and writes what it hears and sends instead of judging it.
+"""
 
 import argparse
+import os
+import re
 import sys
 import tempfile
+import time
 from collections.abc import Sequence
 from contextlib import suppress
+from functools import partial
+from math import inf
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import yaml
+from rclpy.duration import Duration
+from rclpy.publisher import Publisher
+from std_msgs.msg import Float64
 
-from backlash_ros.core.driver_check import WRONG, Judgement, all_fit, judge, table, timing_of
-from backlash_ros.core.identification.motion import waves
-from backlash_ros.nodes.drive import MotionNode
-from backlash_ros.nodes.runtime.process import run, split_arguments
-from backlash_ros.options import DONE, FAILED, OptionParser, add_motion_options, find_config
+from backlash_ros import topics
+from backlash_ros.core import driver_check
+from backlash_ros.core.assembly import build_controller, build_limits
+from backlash_ros.core.control.limits import plausible
+from backlash_ros.core.identification.motion import Drive, drive_limits, strokes, waves
+from backlash_ros.core.parameters.table import CONTROLLER
+from backlash_ros.nodes.control.rivals import CommandLock, name_of
+from backlash_ros.nodes.driver_graph import DriverGraph
+from backlash_ros.nodes.runtime.executor import PromptExecutor
+from backlash_ros.nodes.runtime.messages import DEPTH
+from backlash_ros.nodes.runtime.process import ProcessNode, run, split_arguments
+from backlash_ros.options import (
+    BAD_INPUT,
+    DONE,
+    FAILED,
+    OptionParser,
+    add_motion_options,
+    find_config,
+)
+
+LOOK_S = 0.1  # between two looks at the graph
 
 
-class CheckDriverNode(MotionNode):
-    """Judges what it hears."""
+class CheckDriverNode(ProcessNode):
+    """Hears a driver and, with --drive, answers every plant_output with a control.
 
-    def tell(self) -> None:
-        findings = judge(self.graph.in_the_end(), self.heard, self.settings)
-        if self.ended:
-            findings.append(Judgement(
-                'drive', WRONG, f'{self.ended}: drive ended',
+    v is brought to rest at the end, whatever ends the motion. The parameters are those of the
+    controller.
+    """
+
+    def __init__(self, program: str, options: argparse.Namespace) -> None:
+        super().__init__(program, parameters_of=CONTROLLER)
+        p = self.settings
+        build_controller(p)
+        self._options = options
+        if options.drive:
+            limits = drive_limits(p, options.amplitude, options.rate)
+            self._begin = partial(Drive, strokes if options.messages else waves, limits,
+                                  p.sample_period, options.duration)
+        self._motion: Drive | None = None  # v on its way
+        self._heard = driver_check.Heard()
+        self._file = open(options.messages or os.devnull, 'w', encoding='ascii')  # noqa: SIM115
+        self._names = {topic: self.resolve_topic_name(topic) for topic in self._heard.by_topic}
+        self._graph = DriverGraph(self, self._names)
+        self._lock = CommandLock(self.context.get_domain_id(), self._names[topics.CONTROL])
+        self._control: Publisher
+        self._answers = False
+        self._settled_at = self._newest_at = inf  # everybody found everybody; the newest y came
+        self._ended = self._rivals = ''  # why the motion ended before its time; who else moves v
+
+    def work(self, executor: PromptExecutor) -> None:
+        if self._finds_driver(executor):
+            try:
+                self._follow(executor)
+            finally:
+                self._come_to_rest()
+        self.exit_code = self._tell()
+
+    def _finds_driver(self, executor: PromptExecutor) -> bool:
+        reminder = self.every(3.0, self._graph.say_what_is_missing)
+        deadline, found = time.monotonic() + self._options.wait, False
+        while not (found or self.stopping or time.monotonic() > deadline):
+            executor.spin_once(timeout_sec=LOOK_S)
+            found = bool(self._graph.publishers(topics.PLANT_OUTPUT))
+        self.destroy_timer(reminder)
+        return found and not self.stopping
+
+    def _follow(self, executor: PromptExecutor) -> None:
+        """Listen for the duration; drive for as many samples as it has, late ones as well."""
+        drives, duration_s = self._options.drive, self._options.duration
+        enough = duration_s / self.settings.sample_period if drives else inf
+        self._hear(topics.APPLIED_CONTROL)
+        if drives:
+            self._control = self.create_publisher(Float64, topics.CONTROL, DEPTH)
+        else:
+            self._hear(topics.CONTROL)
+        self._hear(topics.PLANT_OUTPUT)
+        now = time.monotonic()
+        self._settled_at = now + 1.0
+        end = now + duration_s if not drives else self._settled_at + 2.0 * duration_s
+        self.every(LOOK_S, self._look)
+        while not (self.stopping or self._ended or self._rivals or time.monotonic() > end
+                   or len(self._heard.controls) >= enough):
+            executor.spin_once(timeout_sec=LOOK_S)
+        self._look()
+        self._heard.end_ns = time.time_ns()
+
+    def _look(self) -> None:
+        """Take note of who is there. Once heard, a rival counts, even if it leaves."""
+        self._graph.look()
+        self._file.flush()
+        if not self._options.drive:
+            return
+        rivals, now = {*map(name_of, self._graph.publishers(topics.CONTROL))}, time.monotonic()
+        if now > self._settled_at:
+            if not self._lock.take():
+                rivals = rivals or {'a controller of this machine'}
+            self._answers = self._control.get_subscription_count() > 0
+        self._rivals = self._rivals or ', '.join(sorted(rivals))
+        p = self.settings
+        patience_s = max(p.timeout.plant_output, 10.0 * p.sample_period)
+        if self._answers and now > self._newest_at + patience_s:
+            self._ended = f'nothing was heard on {self._names[topics.PLANT_OUTPUT]} for ' \
+                f'{patience_s:g} s'
+
+    def _hear(self, topic: str) -> None:
+        """Subscribe the way that hears whoever publishes, whatever the QoS."""
+        def on_message(message: Float64, info: dict[str, Any]) -> None:
+            if topic == topics.PLANT_OUTPUT:
+                self._newest_at = time.monotonic()
+                if self._answers and not self._rivals:
+                    self._answer(message.data)
+            self._note(topic, driver_check.Message(
+                message.data, info['source_timestamp'], info['received_timestamp'],
+                info['publication_sequence_number']))
+
+        self.listen(Float64, topic, on_message, self._graph.profile(topic))
+
+    def _note(self, topic: str, message: driver_check.Message) -> None:
+        self._heard.by_topic[topic].append(message)
+        print(topic, message.stamp_ns, repr(message.value), sep=',', file=self._file)
+
+    def _answer(self, y: float) -> None:
+        """Move v on by a sample, unless the motion has ended."""
+        low, high = self._options.output_range or (-inf, inf)
+        if plausible(y) and not low <= y <= high:
+            self._ended = self._ended or f'y = {y:.4g} left --output-range'
+        if self._ended:
+            return
+        if self._motion is None:
+            self._motion = self._begin(self._v_at_start())
+        v, now = self._motion.step(), time.time_ns()
+        self._control.publish(Float64(data=v))
+        self._note(topics.CONTROL, driver_check.Message(v, now, now, 0))
+
+    def _v_at_start(self) -> float:
+        """The v that acts before the motion, 0 where nobody says it."""
+        initial = self.settings.control.initial
+        known = initial if plausible(initial) else None
+        for message in self._heard.applied[-1:]:
+            if plausible(message.value):
+                return build_limits(self.settings).go_on_from(message.value, known)
+        if known is None:
+            self._say('nobody says which v acts now, so the drive goes on from 0: publish '
+                      f'{topics.APPLIED_CONTROL}, or set control.initial')
+        return known or 0.0
+
+    def _come_to_rest(self) -> None:
+        if self._motion is None:
+            return
+        before, deadline = len(self.signals), time.monotonic() + self._options.rest
+        v = self._heard.controls[-1].value
+        for v in self._motion.to_rest():
+            self._control.publish(Float64(data=v))
+            time.sleep(self.settings.sample_period)
+            late = time.monotonic() > deadline
+            if late or len(self.signals) > before:
+                why = f'not at rest within --rest={self._options.rest:g} s' if late \
+                    else 'another signal came'
+                self._say(f'v is held at {v:.6g}: {why}')
+                break
+        # A busy machine may lose a message, and this one is to be heard before the node leaves.
+        for _ in range(10):
+            self._control.publish(Float64(data=v))
+            if self._control.wait_for_all_acked(Duration(seconds=0.1)):
+                return
+        self._say(f'the driver has not confirmed the last v={v:.6g}')
+
+    def _tell(self) -> int:
+        """Say what came of it; returns the exit code."""
+        options, heard, names = self._options, self._heard, self._names
+        if self._rivals:
+            self._say(f'{names[topics.CONTROL]} is published by {self._rivals}: stop that first, '
+                      'or leave --drive out')
+            return BAD_INPUT
+        if options.messages:
+            if self._ended:
+                self._say(f'{self._ended}: drive ended')
+            if self._motion is None:
+                why = f'nobody subscribes to {names[topics.CONTROL]}' if heard.outputs \
+                    else f'nothing was heard on {names[topics.PLANT_OUTPUT]}'
+                self._say(f'the actuator was not moved: {why}')
+            return FAILED if self._motion is None else DONE
+        findings = driver_check.judge(self._graph.in_the_end(), heard, self.settings)
+        if self._ended:
+            findings.append(driver_check.Judgement(
+                'drive', driver_check.WRONG, f'{self._ended}: drive ended',
                 'let y come all the time; widen --output-range, or drive less: --amplitude, --rate',
             ))
-        print(table(findings), flush=True)
-        if self.options.save is not None:
-            self._save(self.options.save)
-        self.exit_code = DONE if all_fit(findings) else FAILED
+        print(driver_check.table(findings), flush=True)
+        if options.save is not None:
+            self._save(options.save)
+        return DONE if driver_check.all_fit(findings) else FAILED
 
     def _save(self, path: Path) -> None:
         period = self.settings.sample_period
-        record = timing_of(self.heard, period).record
+        record = driver_check.timing_of(self._heard, period).record
         if record is None:
-            self.say(f'nothing to save in {path}: v and y were not both heard')
+            self._say(f'nothing to save in {path}: v and y were not both heard')
             return
         rows = np.column_stack([period * np.arange(len(record[0])), *record])
         try:
             np.savetxt(path, rows, '%.12g', ',', header='t,v,y', comments='')
             print(f'saved {len(rows)} samples of v and y in {path}')
         except OSError as error:
-            self.say(f'{path}: cannot be written: {error.strerror}')
+            self._say(f'{path}: cannot be written: {error.strerror}')
+
+    def _say(self, text: str) -> None:
+        print(f'{self.get_name()}: {text}', file=sys.stderr)
 
 
 def parse_options(plain: Sequence[str]) -> argparse.Namespace:
@@ -54,6 +240,8 @@ def parse_options(plain: Sequence[str]) -> argparse.Namespace:
     parser.add_argument('--drive', action='store_true', help='move v, to and fro within '
                         'the limits of control, to rest at the end')
     parser.add_argument('--save', type=Path, metavar='FILE', help='write t,v,y as CSV')
+    # Of `identify`: a line for each message, with topic, time stamp [ns] and value.
+    parser.add_argument('--messages', help=argparse.SUPPRESS)
     add_motion_options(parser, 10.0, 'how long to listen')
     options = parser.parse_args(plain)
     for name in ('amplitude', 'rate'):
@@ -65,21 +253,19 @@ def parse_options(plain: Sequence[str]) -> argparse.Namespace:
 def main(args: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     plain, given = split_arguments(args)
-    options, files = parse_options(plain), list[Path]()
+    options = parse_options(plain)
+    program = 'identify' if options.messages else 'check_driver'
     with tempfile.TemporaryDirectory() as folder:
         if options.config is not None:
-            files = [find_config(Path(options.config))]
-            # What it holds for the controller alone. Of a broken file rcl says what is wrong.
-            with suppress(OSError, UnicodeDecodeError, yaml.YAMLError, TypeError):
-                document = yaml.safe_load(files[0].read_text(encoding='utf-8'))
-                for section in ('/**/controller', 'controller', '/controller'):
-                    if section in document:
-                        path = Path(folder) / f'{len(files)}.yaml'
-                        path.write_text(yaml.safe_dump({'/**': document[section]}))
-                        files.append(path)
-        for file in reversed(files):
-            given = ['--ros-args', '--params-file', str(file), *given]
-        return run('check_driver', lambda: CheckDriverNode('check_driver', options, waves), given)
+            config = find_config(Path(options.config))
+            meant = Path(folder) / config.name
+            # Sections for the controller are for this node. What is broken, rcl says of the file.
+            with suppress(OSError):
+                meant.write_bytes(re.sub(rb'(?m)^(\S*)\bcontroller(?=["\']?:)',
+                                         rb'\1' + program.encode(), config.read_bytes()))
+            for file in (meant, config):
+                given = ['--ros-args', '--params-file', str(file), *given]
+        return run(program, lambda: CheckDriverNode(program, options), given)
 
 
 if __name__ == '__main__':

@@ -53,13 +53,11 @@ class DriverGraph:
         """Say which topic is waited for, and which ones there are."""
         wanted = self._names[topics.PLANT_OUTPUT]
         seen = self._topics(self._node.get_publishers_info_by_topic)
-        print(f'waiting for {wanted} ({FLOAT64})')
-        near = similar_topics(wanted, seen)
-        for topic in near:
-            print(f'  sees {topic} ({", ".join(seen[topic])}); if that is it: '
-                  f'--ros-args -r {topics.PLANT_OUTPUT}:={topic}')
-        others = ', '.join(sorted(seen.keys() - set(near))) or 'no other topic'
-        print(f'  sees {"besides " if near else ""}{others}', flush=True)
+        print(f'waiting for {wanted} ({FLOAT64}), sees {", ".join(sorted(seen)) or "no topic"}',
+              flush=True)
+        for near in similar_topics(wanted, seen):
+            print(f'  if {near} ({", ".join(seen[near])}) is it: --ros-args -r '
+                  f'{topics.PLANT_OUTPUT}:={near}', flush=True)
 
     def _topics(self, endpoints: Callable[[str], list[TopicEndpointInfo]]) -> dict[str, list[str]]:
         """Topics that others have such endpoints of, with their types, but for those of ROS."""

@@ -43,7 +43,7 @@ def drive(
         path.touch()
         period = given.get('sample_period')
         write_config(Parameters(dict(given)), config)
-        command = [sys.executable, '-m', 'backlash_ros.nodes.drive',
+        command = [sys.executable, '-m', 'backlash_ros.nodes.check_driver', '--drive',
                    '--messages', str(path), '--config', str(config)]
         for name in ('duration', 'wait', 'rest', 'amplitude', 'rate', 'output_range'):
             value = getattr(options, name)
