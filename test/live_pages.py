@@ -21,12 +21,10 @@ def address_of(session: Session) -> str:
 
 
 def frames(address: str) -> Iterator[dict[str, Any]]:
-    known = 0
-    while True:
-        with urlopen(f'{address}/frame?known={known}', timeout=DEADLINE_S) as response:
-            frame = json.load(response)
-        known = frame['count']
-        yield frame
+    with urlopen(f'{address}/frames', timeout=DEADLINE_S) as response:
+        for line in response:
+            if line.startswith(b'data: '):
+                yield json.loads(line.removeprefix(b'data: '))
 
 
 def listening_addresses(process: int) -> set[str]:

@@ -25,17 +25,17 @@ from backlash_ros.topics import BACKLASH, DIAGNOSTICS
 class ControllerState:
     """One controller, or a joint of it.
 
-    estimates: value and half width of its band of two deviations. watched: label, time of arrival
-    [ns] and value of what came at the last look.
+    estimates: value and half width of its band of two deviations. watched: by label, the time of
+    arrival [ns] and the value of what came at the last look.
     """
 
     def __init__(self, node: str, joint: str = '') -> None:
         self.node = node
         self.name = f'{node}: {joint}' if joint else node  # as /diagnostics calls it
         self.subscriptions: list[Subscription] = []  # polled ones
-        self.watched: list[tuple[str, int, float]] = []
-        self.level, self.message = 0, ''
-        self.heard_at_s = -inf  # on the steady clock
+        self.watched: dict[str, list[tuple[int, float]]] = {}
+        self.message, self._level = '', 0
+        self._heard_at_s = -inf  # on the steady clock
         self.values: dict[str, str] = {}
         self.estimates = dict.fromkeys(BACKLASH, (nan, nan))
         self.events: deque[tuple[str, str]] = deque(maxlen=20)
@@ -46,14 +46,14 @@ class ControllerState:
         before, after = (re.sub(r'[\d.]+', '', text) for text in (self.message, status.message))
         if after != before:
             self.note(status.message)
-        self.level, self.message = min(ord(status.level), 2), status.message
-        self.heard_at_s = now_s
+        self.message, self._level = status.message, min(ord(status.level), 2)
+        self._heard_at_s = now_s
         self.values = {pair.key: pair.value for pair in status.values}
         for name in BACKLASH:
             self.estimates[name] = self.number(name), 2.0 * self.number(f'std_{name}')
 
     def hear_value(self, label: str, message: Float64, info: dict[str, Any]) -> None:
-        self.watched.append((label, info['received_timestamp'], message.data))
+        self.watched.setdefault(label, []).append((info['received_timestamp'], message.data))
         if label in BACKLASH:
             self.estimates[label] = message.data, self.estimates[label][1]
 
@@ -66,78 +66,81 @@ class ControllerState:
         except ValueError:
             return nan
 
-    @property
-    def excitation(self) -> float:
-        return self.number('excitation: swing of v / gap')
-
     def is_on(self, key: str) -> bool:
         return self.values.get(key) == 'True'
 
-    def silent_s(self, now_s: float) -> float:
+    @property
+    def silent_s(self) -> float:
         """How long nothing was heard of it, 0 as long as that means nothing."""
-        passed = now_s - self.heard_at_s
+        passed = time.monotonic() - self._heard_at_s
         return passed if SILENT_S < passed < inf else 0.0
 
-    def word(self, now_s: float) -> str:
+    @property
+    def level(self) -> int:
+        """0 well, 1 warning, 2 error; nobody knows how somebody is who says nothing any more."""
+        return 2 if self.silent_s else self._level
+
+    @property
+    def word(self) -> str:
         if not self.message:
             return 'no diagnostics yet'
-        if silent_s := self.silent_s(now_s):
+        if silent_s := self.silent_s:
             return f'silent for {silent_s:.0f} s'
         # What the estimates were when it was deactivated is no state of the controller.
         beginning = self.message.partition(':')[0]
         return beginning if beginning == 'inactive' else self.values.get('state') or beginning
 
 
-class FollowedControllers:
-    """Every controller of the domain, or those of the wanted namespaces, by name.
+class ViewerNode(ProcessNode):
+    """Knows every controller of the domain, or those of the wanted namespaces.
 
     labels: which of the messages below `controller/watch` to take; depth: how many may wait.
+    states: by name, in the order in which they were found.
     """
 
-    def __init__(
-        self, node: ProcessNode, wanted: Sequence[str], labels: Sequence[str], depth: int,
-    ) -> None:
-        self._node, self._labels, self._depth = node, labels, depth
-        self._wanted = tuple(f'/{name.strip("/")}/'.replace('//', '/') for name in wanted) or '/'
+    def __init__(self, name: str, wanted: Sequence[str], labels: Sequence[str], depth: int) -> None:
+        super().__init__(name)
+        self._labels, self._depth = labels, depth
+        self._wanted = tuple(f'/{each.strip("/")}/'.replace('//', '/') for each in wanted) or '/'
         which = ' of ' + ', '.join(wanted) if wanted else ''
         self.awaited = f'waiting for a controller{which} in ROS_DOMAIN_ID=' \
-            f'{node.context.get_domain_id()}: bringup prints which one it uses'
-        self.by_name: dict[str, ControllerState] = {}
+            f'{self.context.get_domain_id()}: bringup prints which one it uses'
+        self.states: dict[str, ControllerState] = {}
         # Those of all nodes of the domain: some robots have many.
-        self._diagnostics = node.listen(
+        self._diagnostics = self.listen(
             DiagnosticArray, DIAGNOSTICS, self._hear, qos=100, polled=True
         )
-        node.every(1.0, self._look)
-        self._look()
+        self.every(1.0, self._find)
+        self._find()
 
     def take_messages(self) -> None:
         """Take in what has come since the last call: nothing wakes up for each message."""
         serve_polled(self._diagnostics)
-        for state in self.by_name.values():
+        for state in self.states.values():
             state.watched.clear()
             for subscription in state.subscriptions:
                 serve_polled(subscription)
 
     def _hear(self, message: DiagnosticArray, info: dict[str, Any]) -> None:
         for status in message.status:
-            if state := self.by_name.get(f'/{status.name}'):
+            if state := self.states.get(f'/{status.name}'):
                 state.hear(status, time.monotonic())
 
-    def _look(self) -> None:
+    def _find(self) -> None:
         """Whoever publishes what a controller publishes is one."""
-        for topic, _ in sorted(self._node.get_topic_names_and_types()):
+        for topic, _ in sorted(self.get_topic_names_and_types()):
             # By this a controller is known, or a joint of it.
-            found = re.fullmatch(rf'(?P<node>.*)/watch/((?P<joint>[^/]+)/)?{BACKLASH[0]}', topic)
-            if found is None or not f'{found["node"]}/'.startswith(self._wanted):
+            found = re.fullmatch(rf'(.*)/watch/(?:([^/]+)/)?{BACKLASH[0]}', topic)
+            if found is None or not f'{found[1]}/'.startswith(self._wanted):
                 continue
-            state = ControllerState(found['node'], found['joint'] or '')
-            if state.name not in self.by_name:
+            state = ControllerState(found[1], found[2] or '')
+            if state.name not in self.states:
                 folder = topic.removesuffix(BACKLASH[0])
-                state.subscriptions = [self._node.listen(
+                state.subscriptions = [self.listen(
                     Float64, folder + label, partial(state.hear_value, label), self._depth,
                     polled=True,
                 ) for label in self._labels]
-                self.by_name[state.name] = state
+                self.states[state.name] = state
 
 
 def viewer_options(name: str, description: str | None, epilog: str) -> OptionParser:

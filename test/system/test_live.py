@@ -53,9 +53,9 @@ def test_alone_it_waits_for_a_controller_and_ends_with_ctrl_c(tmp_path: Path) ->
 def test_a_page_shows_every_axis_to_this_machine_alone_and_a_run_goes_on_without_it(run):
     heard: dict[str, set[str]] = {}
     for frame in frames(address_of(run)):
-        for portion in frame['portions']:
-            for name, curves in portion.items():
-                heard.setdefault(name, set()).update(curves)
+        for curves in frame['curves']:
+            for name, of_controller in curves.items():
+                heard.setdefault(name, set()).update(of_controller)
         complete = [labels for labels in heard.values() if set(LIVE_LABELS) <= labels]
         if len(complete) == 2 and all(
             each['values'].get('rate [Hz]') for each in frame['state']['controllers']

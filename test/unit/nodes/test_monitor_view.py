@@ -1,9 +1,9 @@
 """What `monitor` shows of a controller, without ROS and without a terminal."""
 
 import re
+import time
 from collections.abc import Mapping
 from io import StringIO
-from math import inf
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
@@ -22,12 +22,12 @@ LONG = 'plant_output moves against v: reverse it, or the sign of plant.numerator
 
 
 def say(
-    state: ControllerState, message: str, now_s: float = 100.0, level: int = 0,
-    values: Mapping[str, str] = VALUES,
+    state: ControllerState, message: str, level: int = 0, values: Mapping[str, str] = VALUES,
+    silent_s: float = 0.0,
 ) -> None:
     state.hear(DiagnosticStatus(level=bytes([level]), message=message, values=[
         KeyValue(key=key, value=value) for key, value in values.items()
-    ]), now_s)
+    ]), time.monotonic() - silent_s)
 
 
 def controller(
@@ -40,7 +40,7 @@ def controller(
 
 def shown(states: list[ControllerState], **changes: object) -> list[str]:
     console = Console(file=StringIO(), width=80, height=24, force_terminal=False)
-    arguments = {'selected': 0, 'notice': '', 'now_s': 100.5, 'width': 80, 'height': 24, **changes}
+    arguments = {'selected': 0, 'notice': '', 'height': 24, **changes}
     console.print(screen(states, **arguments))  # type: ignore[arg-type]
     assert isinstance(console.file, StringIO)
     return console.file.getvalue().rstrip('\n').split('\n')
@@ -75,22 +75,24 @@ def test_any_number_of_controllers_fits_into_a_terminal(count: int) -> None:
 
 def test_a_text_in_which_only_figures_change_is_one_event() -> None:
     state = controller(message='9.38 % was lost')
-    say(state, '8.1 % was lost', 101.0, level=1)
-    say(state, 'learned', 102.0)
+    say(state, '8.1 % was lost', level=1)
+    say(state, 'learned')
     assert [text for _, text in state.events] == ['9.38 % was lost', 'learned']
     assert state.message == 'learned'
 
 
 def test_who_says_nothing_any_more_is_silent() -> None:
     state = controller()
-    assert (state.word(102.0), state.word(107.2)) == ('tracking', 'silent for 7 s')
-    assert ControllerState('/controller').word(inf) == 'no diagnostics yet'
+    assert (state.word, state.level) == ('tracking', 0)
+    say(state, 'learned', silent_s=7.2)
+    assert (state.word, state.level) == ('silent for 7 s', 2)
+    assert ControllerState('/controller').word == 'no diagnostics yet'
 
 
 def test_an_inactive_controller_is_told_by_its_message() -> None:
     state = ControllerState('/controller')
     say(state, 'unconfigured', values={})
-    assert state.word(100.0) == 'unconfigured'
+    assert state.word == 'unconfigured'
     assert any('unconfigured' in line for line in shown([state]))
     say(state, 'inactive: no control is published', values={'state': 'tracking'})
-    assert state.word(100.0) == 'inactive'
+    assert state.word == 'inactive'
