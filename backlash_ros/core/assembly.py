@@ -8,10 +8,13 @@ import numpy as np
 from backlash_ros.core.control.controller import DOUBT, AdaptiveController, SerialPlant
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.limits import Limits, check_last_commands
-from backlash_ros.core.control.paper_structure import PolePlacement, Proportional
-from backlash_ros.core.control.protocol import ControlStructure
-from backlash_ros.core.control.tracking.design import better_design, design, power_gain
-from backlash_ros.core.control.tracking.preview import preview_gains
+from backlash_ros.core.control.structure import ControlStructure, PolePlacement, Proportional
+from backlash_ros.core.control.tracking.design import (
+    better_design,
+    design,
+    power_gain,
+    preview_gains,
+)
 from backlash_ros.core.control.tracking.tracking import Tracking
 from backlash_ros.core.estimate import Bounds, Estimate
 from backlash_ros.core.estimates_file import load_estimate

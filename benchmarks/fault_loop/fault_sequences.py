@@ -13,7 +13,7 @@ from fault_loop.promises import PromisedBound, Uninterrupted
 from backlash_ros.core.assembly import build_model, build_true_model
 from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.control.limits import Limits
-from backlash_ros.core.control.paper_structure import LARGEST_F_OVER_M
+from backlash_ros.core.control.structure import LARGEST_F_OVER_M
 from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.estimates_file import was_given
 from backlash_ros.core.parameters import ParameterError, Parameters

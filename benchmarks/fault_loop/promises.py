@@ -12,8 +12,8 @@ from backlash_ros.core import Parameters, Status, build_controller, build_plant
 from backlash_ros.core.assembly import build_model, build_state_model
 from backlash_ros.core.control.controller import AdaptiveController, ControlStep
 from backlash_ros.core.control.limits import at_rest
-from backlash_ros.core.control.paper_structure import LARGEST_F_OVER_M
-from backlash_ros.core.control.protocol import (
+from backlash_ros.core.control.structure import (
+    LARGEST_F_OVER_M,
     LARGEST_FEEDBACK,
     LARGEST_IN_ACQUISITION,
     ControlInput,

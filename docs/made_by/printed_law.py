@@ -8,8 +8,7 @@ from math import isfinite, sin
 import numpy as np
 
 from backlash_ros.core.control.inverse import BacklashInverse
-from backlash_ros.core.control.paper_structure import Proportional
-from backlash_ros.core.control.protocol import Command, ControlInput
+from backlash_ros.core.control.structure import Command, ControlInput, Proportional
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.laws.printed_law import printed_c, printed_f, printed_m
 from backlash_ros.core.plant.backlash import Backlash

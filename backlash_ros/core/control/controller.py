@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from copy import copy
 from dataclasses import dataclass, replace
 from math import isnan, nan
 from typing import NamedTuple
 
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.limits import LARGEST_SIGNAL, Limits, at_rest, plausible
-from backlash_ros.core.control.protocol import ControlInput, ControlStructure
+from backlash_ros.core.control.structure import ControlInput, ControlStructure
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.estimation.settings import OUTLIERS
 from backlash_ros.core.jobs import LOST, Channel, Executor, Failure
 from backlash_ros.core.law import Interval, Law, StateSource
 from backlash_ros.core.laws.fixed import FixedBacklash
+from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.actuator import Actuator, Motor
 from backlash_ros.core.plant.backlash import clamp
 from backlash_ros.core.plant.transfer_function import StateModel
@@ -127,14 +127,17 @@ class AdaptiveController:
         self.inverse.start_from(v)
 
     def go_on_from(self, before: AdaptiveController) -> None:
-        """Take over v and the learned G as the state of the plant got unknown; `before` ends."""
-        own, self.inverse = self.inverse, copy(before.inverse)
-        self.inverse.direction_band, self.inverse.take_up = own.direction_band, own.take_up
-        self.motion = before.motion
+        """Go on where `before` ends, with v and the learned G; the state got unknown."""
+        self.inverse, self.motion, self.structure = before.inverse, before.motion, before.structure
         if self.redesign is not None and before.redesign is not None:
             self.redesign.considered = before.redesign.considered
             self._adopt(self.redesign, before.redesign.adopted)
-        self.structure.go_on_from(before.structure, state_known=False)
+        self.structure.restart()
+
+    def retune(self, p: Parameters) -> None:
+        """Take up new values of parameters of law and structure; what was learned stays."""
+        self.estimator.retune(p)
+        self.structure.retune(p, self._source)
 
     def close(self) -> None:
         """Give back what estimator and designs hold elsewhere."""

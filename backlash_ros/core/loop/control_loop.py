@@ -7,7 +7,7 @@ from enum import Enum
 from math import isfinite, nan
 from typing import NamedTuple
 
-from backlash_ros.core.assembly import build_controller, build_limits, build_structure, first_guess
+from backlash_ros.core.assembly import build_controller, build_limits, first_guess
 from backlash_ros.core.control.controller import LONGEST_GAP, ControlStep
 from backlash_ros.core.control.limits import Motion, at_rest, last_commands, plausible
 from backlash_ros.core.estimate import Estimate, Status
@@ -15,7 +15,7 @@ from backlash_ros.core.jobs import Executor
 from backlash_ros.core.loop.command_history import CommandHistory, report_use
 from backlash_ros.core.loop.loop_statistics import LoopStatistics
 from backlash_ros.core.loop.sample_counter import NEXT_SAMPLE, Arrival, Output, SampleCounter
-from backlash_ros.core.parameters import NOISE, Parameters
+from backlash_ros.core.parameters import Parameters
 
 
 class Phase(Enum):
@@ -307,16 +307,11 @@ class ControlLoop:
 
     def take_up(self, p: Parameters) -> None:
         """Use other values of the live parameters; what was learned stays."""
-        before, self._p, core = self._p, p, self.core
+        self._p, core = p, self.core
         core.limits = build_limits(p)
         core.inverse.direction_band = p.inverse.direction_band
         core.inverse.take_up = p.inverse.take_up_rate * p.sample_period
-        core.estimator.retune(p)
-        used = 'tracking.input_weight', 'tracking.integral_weight', 'inverse.caution', NOISE
-        if any(p[name] != before[name] for name in used):
-            structure = build_structure(p)
-            structure.go_on_from(core.structure)
-            core.structure = structure
+        core.retune(p)
 
     def _go_on_from(self, told: float) -> None:
         v = self.core.limits.go_on_from(told, self.v if self.knows_v else None)

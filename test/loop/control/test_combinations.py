@@ -9,8 +9,7 @@ from combinations_of_laws import AMPLITUDES, CONDITIONS, Sample, outcome, run
 from places import ROOT
 
 from backlash_ros.core.assembly import LAWS, STRUCTURES, build_controller, law_fits
-from backlash_ros.core.control.paper_structure import LARGEST_F_OVER_M
-from backlash_ros.core.control.protocol import LARGEST_FEEDBACK
+from backlash_ros.core.control.structure import LARGEST_F_OVER_M, LARGEST_FEEDBACK
 from backlash_ros.core.estimates_file import was_given
 from backlash_ros.core.parameters import ParameterError, Parameters
 

@@ -7,7 +7,7 @@ import pytest
 from strategies import GEAR, known_backlash
 
 from backlash_ros.core import Parameters, build_closed_loop, build_controller
-from backlash_ros.core.assembly import build_state_model, build_structure
+from backlash_ros.core.assembly import build_state_model
 from backlash_ros.core.control.controller import AdaptiveController
 from backlash_ros.core.control.tracking.design import design
 
@@ -26,9 +26,7 @@ def restarted(core: AdaptiveController) -> AdaptiveController:
 
 
 def with_other_weights(core: AdaptiveController) -> AdaptiveController:
-    structure = build_structure(PARAMETERS.replaced({'tracking.input_weight': 0.1}))
-    structure.go_on_from(core.structure)
-    core.structure = structure
+    core.retune(PARAMETERS.replaced({'tracking.input_weight': 0.1}))
     return core
 
 

@@ -16,7 +16,7 @@ from backlash_ros.core.assembly import build_model, build_true_model
 from backlash_ros.core.control.controller import LONGEST_WAIT, AdaptiveController
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.limits import Limits
-from backlash_ros.core.control.protocol import ControlStructure
+from backlash_ros.core.control.structure import ControlStructure
 from backlash_ros.core.control.tracking import design as designs
 from backlash_ros.core.control.tracking.tracking import Tracking
 from backlash_ros.core.law import Interval, Law, LawReport

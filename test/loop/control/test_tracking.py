@@ -9,11 +9,15 @@ from strategies import known_backlash
 
 from backlash_ros.core.assembly import build_controller, build_model, build_plant, build_reference
 from backlash_ros.core.control.inverse import BacklashInverse
-from backlash_ros.core.control.tracking.design import design, modulus_margin
+from backlash_ros.core.control.tracking.design import (
+    PreviewGains,
+    design,
+    modulus_margin,
+    preview_gains,
+)
 from backlash_ros.core.control.tracking.feedback import shrunk_crossings
-from backlash_ros.core.control.tracking.preview import PreviewGains, preview_gains
 from backlash_ros.core.control.tracking.rest import SHORT, Mode, Rest
-from backlash_ros.core.control.tracking.trajectory import TrajectoryState
+from backlash_ros.core.control.tracking.trajectory import IdealTrajectory
 from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import TrackingWeights
@@ -130,16 +134,16 @@ def test_v_comes_to_rest_after_a_motion_in_spite_of_noise(seed: int) -> None:
 
 def test_a_step_to_rest_stops_short_of_the_u_at_rest_by_what_is_uncertain() -> None:
     rest, inverse, estimate = resting(std=0.01)
-    x = [0.0, 0.0]
-    plan = TrajectoryState(x)
-    assert rest.decide(0.0, 1e-3, 0.0, 0.0, plan, x, 0.0, inverse.side, 0.0, False) is Mode.HOLD
-    rest.step(estimate, 0.0, 0.0, 0.0, inverse, begins=True)
+    model, x = StateModel(TransferFunction([0.1], [1.0, -1.9, 0.9])), [0.0, 0.0]
+    plan = IdealTrajectory(design(model, TrackingWeights(10, 1e-2, 0.0)))
+    assert rest.decide(0.0, 1e-3, plan, x, 0.0, inverse.side, 0.0, False) is Mode.HOLD
+    rest.step(estimate, plan, 0.0, inverse, begins=True)
     # From u = 1 down to 0, where c_l = -1 may lie 0.01 higher or lower.
     assert stepped(rest, inverse, estimate) == pytest.approx(-1.0 + SHORT * 0.01)
-    rest.step(estimate, 0.0, 0.0, 0.0, inverse, begins=False)
+    rest.step(estimate, plan, 0.0, inverse, begins=False)
     assert not inverse.taking_up, 'nothing more is known, so nothing more is done'
     known = resting(std=0.001)[2]
-    rest.step(known, 0.0, 0.0, 0.0, inverse, begins=False)
+    rest.step(known, plan, 0.0, inverse, begins=False)
     assert stepped(rest, inverse, known) == pytest.approx(-1.0 + SHORT * 0.001)
 
 
@@ -150,11 +154,10 @@ def stepped(rest: Rest, inverse: BacklashInverse, estimate: Estimate) -> float:
 
 def resting(std: float) -> tuple[Rest, BacklashInverse, Estimate]:
     """v engaged at u = 1 on the right of a gap from -1 to 1 with m = 1, and what is known of it."""
-    model = StateModel(TransferFunction([0.1], [1.0, -1.9, 0.9]))
     inverse = BacklashInverse()
     inverse.step(1.0, 1.0, 1.0, -1.0)
     estimate = Estimate(1.0, 1.0, -1.0, 0.0, std, std, std, Status.TRACKING)
-    return Rest(design(model, TrackingWeights(10, 1e-2, 0.0))), inverse, estimate
+    return Rest(), inverse, estimate
 
 
 @pytest.mark.parametrize('seed', [14, 319])

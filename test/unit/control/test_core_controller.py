@@ -11,7 +11,7 @@ from strategies import signals
 from backlash_ros.core.control.controller import AdaptiveController
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.limits import Limits
-from backlash_ros.core.control.paper_structure import Proportional
+from backlash_ros.core.control.structure import Proportional
 from backlash_ros.core.estimate import Bounds, Estimate
 from backlash_ros.core.law import Interval, Law
 

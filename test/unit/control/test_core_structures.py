@@ -13,15 +13,19 @@ from strategies import NO_STATE, PAPER_DENOMINATOR, PAPER_NUMERATOR, Play, plant
 from backlash_ros.core import Estimate, Parameters, build_closed_loop
 from backlash_ros.core.assembly import build_four_blocks, build_structure
 from backlash_ros.core.control.inverse import BacklashInverse
-from backlash_ros.core.control.paper_structure import LARGEST_F_OVER_M, Proportional
-from backlash_ros.core.control.protocol import Command, ControlInput
-from backlash_ros.core.control.tracking.design import power_gain
-from backlash_ros.core.control.tracking.preview import (
+from backlash_ros.core.control.structure import (
+    LARGEST_F_OVER_M,
+    Command,
+    ControlInput,
+    Proportional,
+)
+from backlash_ros.core.control.tracking.design import (
     PreviewGains,
-    ReferenceWindow,
     averages,
+    power_gain,
     preview_gains,
 )
+from backlash_ros.core.control.tracking.trajectory import ReferenceWindow
 from backlash_ros.core.parameters import ParameterError
 from backlash_ros.core.plant.numerics import place_poles
 from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction

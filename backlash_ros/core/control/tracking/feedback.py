@@ -10,11 +10,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import hypot, inf, isnan, nan
-from typing import NamedTuple
 
 import numpy as np
 
-from backlash_ros.core.control.protocol import LARGEST_FEEDBACK, LARGEST_IN_ACQUISITION
+from backlash_ros.core.control.structure import LARGEST_FEEDBACK, LARGEST_IN_ACQUISITION
 from backlash_ros.core.control.tracking.design import SOFTEST, TrackingDesign, dot
 from backlash_ros.core.control.tracking.rest import ARRIVED, ASTRAY, CLOSE, TOLERANCE, UNCERTAIN
 from backlash_ros.core.estimate import Estimate, Status
@@ -55,25 +54,16 @@ class FeedbackState:
     blind_for: int = 1  # samples from now on in which x_hat cannot be known
 
 
-class DeviationNoise(NamedTuple):
-    """How much of x_hat - x* may be noise: of y, of x_hat, and of the references that make x*."""
-
-    u_std: list[float]  # of K (x_hat - x*) for each gain, at least K times half the noise of y
-    x_cov: Array | None = None  # of x_hat, None where it is unknown
-    x_std: float = 0.0  # of |x_hat|
-    ignored: float = 0.0  # |x_hat - x*| that is left alone
-    tolerated: float = 0.0  # |x_hat - x*| that is worth no crossing
-
-
 class StateFeedback:
     """Gains of a design, used as far as the estimate is trusted; shrinkage: see Tracking.
 
     While nothing is known the acquisition gain replaces K, and the trajectory excites the backlash.
+    u_std: of K (x_hat - x*) for each gain, at least K times half the noise of y. x_std: of |x_hat|.
     """
 
     def __init__(self, design: TrackingDesign, shrinkage: float, noise_std: float) -> None:
         self.trust, self.state = Trust(), FeedbackState()
-        self._shrinkage, self.y_std = shrinkage, noise_std
+        self.shrinkage, self.y_std = shrinkage, noise_std
         self._newest: Estimate | None = None
         self.gap_u = 0.0  # that the gap takes
         self.use(design)
@@ -82,18 +72,18 @@ class StateFeedback:
         """Use these gains."""
         self._design = design
         self._least = 0.5 * self.y_std * np.array([hypot(*gain) for gain in design.schedule])
-        self.noise = DeviationNoise(self._least.tolist())
+        self.u_std: list[float] = self._least.tolist()
+        # |x_hat - x*| that may be noise, so that it is left alone, or worth no crossing.
+        self.x_std = self._ignored = self._tolerated = 0.0
+        self._knows_x = False  # whether the covariance of x_hat is known
         # Places in the schedule: of the gain that its noise asks for, and of the one in use.
         self._quiet = self._in_use = 0
 
-    def go_on_from(self, other: StateFeedback, state_known: bool) -> None:
-        """Go on where another one is; from the softest, where x_hat begins anew, full of noise."""
-        self.trust, self.state, self.gap_u = other.trust, other.state, other.gap_u
-        self.prepare(other.noise.x_cov, self.y_std)
-        if not state_known:
-            self.trust = Trust(sharp_counts=1)
-            self.state = replace(self.state, width=1.0, asked=0.0, bounded=False,
-                                 blind_for=self._design.model.order)
+    def restart(self) -> None:
+        """Go on from the softest, as x_hat begins anew, full of noise."""
+        self.trust, self._newest = Trust(sharp_counts=1), None
+        self.state = replace(self.state, width=1.0, asked=0.0, bounded=False,
+                             blind_for=self._design.model.order)
 
     def take(self, estimate: Estimate, ideal: float, first: bool) -> bool:
         """Take in estimate and u* of this sample; returns whether the estimate is another one."""
@@ -104,7 +94,7 @@ class StateFeedback:
             # deviations says by its status alone that it has learned, and holds that later.
             trust.known = status not in (Status.ACQUIRING, Status.INCONSISTENT) and (
                 trust.known or estimate.learned or status is Status.TRACKING)
-            trust.crossings = shrunk_crossings(estimate, self._shrinkage, trust.known)
+            trust.crossings = shrunk_crossings(estimate, self.shrinkage, trust.known)
             # On the way to its first agreement with the data the m of such a law may be anywhere.
             if isnan(trust.slope) or estimate.learned or status is Status.TRACKING:
                 trust.slope = estimate.m
@@ -125,27 +115,24 @@ class StateFeedback:
         return another
 
     def prepare(
-        self, x_cov: Array | None, y_std: float, x_noise: Array | None = None,
-        reference_std: float = 0.0,
+        self, x_cov: Array | None, y_std: float, x_noise: Array, reference_std: float,
     ) -> None:
         """Choose the gain that noise allows; x_noise: covariance of x* for noise of 1 in r."""
-        u_std, _, x_std, *_ = self.noise
-        deviation_std = 0.0
+        deviation_std, self._knows_x = 0.0, x_cov is not None
         if x_cov is not None:
-            variances = of_x_hat = self._design.variances(x_cov)
-            if x_noise is not None:
-                variances = of_x_hat + reference_std**2 * self._design.variances(x_noise)
-            stds = np.sqrt(np.maximum(variances, 0.0))
-            x_std = max(of_x_hat.item(-1), 0.0)**0.5
-            u_std, deviation_std = np.maximum(stds[:-1], self._least).tolist(), stds.item(-1)
+            of_x_hat = self._design.variances(x_cov)
+            of_both = of_x_hat + reference_std**2 * self._design.variances(x_noise)
+            stds = np.sqrt(np.maximum(of_both, 0.0))
+            self.x_std = max(of_x_hat.item(-1), 0.0)**0.5
+            self.u_std, deviation_std = np.maximum(stds[:-1], self._least).tolist(), stds.item(-1)
         # By as much v may rest off: one rule for motion and rest.
-        ignored = ARRIVED * max(CLOSE * y_std, UNCERTAIN * x_std)
+        self._ignored = ARRIVED * max(CLOSE * y_std, UNCERTAIN * self.x_std)
         # What noise of the references moves and v did not follow shows as a deviation as well.
-        tolerated = max(ignored, ARRIVED * UNCERTAIN * deviation_std)
-        self.noise = DeviationNoise(u_std, x_cov, x_std, ignored, tolerated)
+        self._tolerated = max(self._ignored, ARRIVED * UNCERTAIN * deviation_std)
         # As hard as leaves what feedback makes of noise below a tenth of the u that the gap takes.
         most = 0.1 * self.gap_u or inf
-        self._quiet = next((i for i, std in enumerate(u_std) if std <= most), len(u_std) - 1)
+        self._quiet = next((i for i, std in enumerate(self.u_std) if std <= most),
+                           len(self.u_std) - 1)
 
     def deviation(self, x_hat: Sequence[float] | Array, x: Sequence[float]) -> list[float]:
         """x_hat - x*; 0 while x_hat cannot be known."""
@@ -162,7 +149,7 @@ class StateFeedback:
         # Per sample, of the bound while the backlash is unknown; samples without a limit after
         # which feedback takes a step back to full.
         widening, stiffen_after = 1.03, 20
-        state, trust, most, noise = self.state, self.trust, self.bounds[0], self.noise
+        state, trust, most = self.state, self.trust, self.bounds[0]
         if trust.held_for:
             off = hypot(*error)
             if held_back or state.bounded:
@@ -173,13 +160,13 @@ class StateFeedback:
                     state.level -= 1
             # K, or the less of it the longer v does not follow, and the newer the estimate. Far
             # away, beyond what x* has been and noise explains, it does not matter what noise does.
-            astray = off > max(largest, ASTRAY / ARRIVED * noise.ignored)
+            astray = off > max(largest, ASTRAY / ARRIVED * self._ignored)
             unproven = SOFTEST - trust.held_for * (SOFTEST + 1) // TRUSTED_AFTER
             self._in_use = max(state.level, unproven, 0 if astray else self._quiet)
             feedback = worth = dot(self._design.schedule[self._in_use], error)
             if self.knows_noise:
-                feedback *= 1.0 - noise.ignored / max(off, noise.ignored)
-                worth *= 1.0 - noise.tolerated / max(off, noise.tolerated)
+                feedback *= 1.0 - self._ignored / max(off, self._ignored)
+                worth *= 1.0 - self._tolerated / max(off, self._tolerated)
         else:
             feedback = worth = dot(self._design.acquisition or (), error)
             if not -most < feedback < most:
@@ -192,6 +179,11 @@ class StateFeedback:
         if isnan(feedback):
             return 0.0, 0.0
         return min(max(feedback, -most), most), min(max(worth, -most), most)
+
+    def pull_back(self, deviation: Sequence[float]) -> float:
+        """u - u* that brings y back gently."""
+        pull, most = -dot(self._design.gentle, deviation), self.bounds[0]
+        return 0.0 if isnan(pull) else min(max(pull, -most), most)
 
     def furthest(
         self, deviation: Sequence[float], ahead: Sequence[float], side: Region, turns_in: int,
@@ -211,12 +203,12 @@ class StateFeedback:
     @property
     def knows_noise(self) -> bool:
         """Whether full feedback can tell a deviation from noise."""
-        return self.trust.full and self.noise.x_cov is not None
+        return self.trust.full and self._knows_x
 
     @property
     def noise_u(self) -> float:
         """Standard deviation of what feedback makes of noise."""
-        return self.noise.u_std[self._quiet]
+        return self.u_std[self._quiet]
 
     @property
     def bounds(self) -> tuple[float, float]:

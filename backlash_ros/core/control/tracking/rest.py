@@ -11,8 +11,7 @@ from enum import Enum, auto
 from math import hypot
 
 from backlash_ros.core.control.inverse import BacklashInverse
-from backlash_ros.core.control.tracking.design import TrackingDesign, dot
-from backlash_ros.core.control.tracking.trajectory import TrajectoryState
+from backlash_ros.core.control.tracking.trajectory import IdealTrajectory
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.plant.backlash import Region
 
@@ -51,7 +50,6 @@ class Mode(Enum):
 class Rest:
     """Decides whether v rests, and steps it there."""
 
-    design: TrackingDesign
     mode: Mode = Mode.HOLD
     target: tuple[float, float] = (0.0, 0.0)  # u_d where v rests, deviations to shrink its crossing
     side: Region = Region.GAP  # newest line
@@ -65,21 +63,22 @@ class Rest:
     pull: float = 0.0  # u - u* with which leading back began
 
     def decide(
-        self, y: float, noise_std: float, r: float, spread: float, plan: TrajectoryState,
-        deviation: Sequence[float], x_std: float | None, side: Region, pull: float, acts: bool,
+        self, y: float, noise_std: float, plan: IdealTrajectory, deviation: Sequence[float],
+        x_std: float | None, side: Region, pull: float, acts: bool,
     ) -> Mode:
         """Set the mode for this sample.
 
-        spread: of the references, beyond their noise. x_std: of x_hat, None where it is unknown.
-        side: line in use. pull: see `pull_back`. acts: whether feedback asks for more than noise.
+        x_std: of x_hat, None where it is unknown. side: line in use. pull: u - u* that brings y
+        back gently. acts: whether feedback asks for more than noise.
         """
         self.largest = max(self.largest, hypot(*plan.x))
         least = 1e-5 * self.largest  # tolerance, where that is more
         still = 0.004 * max(TOLERANCE * noise_std, least)  # by which x* may move per sample
-        if spread > noise_std or (self.mode is Mode.FOLLOW and plan.moved > still):
+        if plan.spread > noise_std or (self.mode is Mode.FOLLOW and plan.moved > still):
             self.mode, self.rested, self.returns, self.leads = Mode.FOLLOW, 0, 0, 0
         elif x_std is None:
-            self.mode = Mode.RETURN if abs(y - r) > OFF * noise_std else Mode.HOLD
+            off = abs(y - plan.references.window.item(0)) > OFF * noise_std
+            self.mode = Mode.RETURN if off else Mode.HOLD
         else:
             self.rested += 1
             width = CLOSE if self.rested < SETTLING else TOLERANCE
@@ -88,18 +87,18 @@ class Rest:
             self.limit = max(width * noise_std, least, UNCERTAIN * x_std)
             if self.mode is Mode.RETURN and side is not self.side:
                 self.turns += 1
-            self.mode = self._mode_at_rest(hypot(*deviation), pull, acts)
+            self.mode = self._mode_at_rest(hypot(*deviation), len(plan.x), pull, acts)
         self.side = side
         return self.mode
 
-    def _mode_at_rest(self, size: float, pull: float, acts: bool) -> Mode:
+    def _mode_at_rest(self, size: float, order: int, pull: float, acts: bool) -> Mode:
         # Crossing the gap takes time. Full feedback that turns again and again overshoots by that;
         # it is due again when y has stayed where it belongs for a while, and is pushed away.
         self.near = self.near + 1 if size <= self.limit else 0
         if self.near >= SETTLING:
             self.returns = self.leads = 0
         returns = self.mode is Mode.RETURN
-        if self.turns <= self.design.model.order if returns else self.returns < MOST_RETURNS:
+        if self.turns <= order if returns else self.returns < MOST_RETURNS:
             goes_on = not self.mode.steps and acts and size > ARRIVED * self.limit
             if goes_on or size > ASTRAY * self.limit:
                 if not returns:
@@ -114,24 +113,20 @@ class Rest:
         self.pull, self.leads = pull, self.leads + 1
         return Mode.LEAD_BACK
 
-    def pull_back(self, deviation: Sequence[float], most: float) -> float:
-        """u - u* that brings y back gently; most: the largest there may be."""
-        pull = -dot(self.design.gentle, deviation)
-        return min(max(pull, -most), most) if pull == pull else 0.0
-
     def stay(self, inverse: BacklashInverse) -> None:
         """Rest where v is."""
         self.target = inverse.extreme, 0.0
 
     def step(
-        self, estimate: Estimate, ideal: float, noise: float, pull: float,
-        inverse: BacklashInverse, begins: bool,
+        self, estimate: Estimate, plan: IdealTrajectory, pull: float, inverse: BacklashInverse,
+        begins: bool,
     ) -> None:
-        """Aim v at where it is to rest, where that is better than to stay; ideal: u*, and noise."""
+        """Aim v at where it is to rest, where that is better than to stay."""
         if begins:
             self.stay(inverse)
         if inverse.taking_up or inverse.side is Region.GAP:
             return  # still on its way, or nobody knows what u is
+        ideal = plan.u
         engaged = estimate.c_l if inverse.side is Region.LEFT else estimate.c_r
         u = estimate.m * (inverse.v - engaged)
         if self.mode is Mode.LEAD_BACK:
@@ -142,8 +137,8 @@ class Rest:
             side_std = estimate.std_c_r if ideal > u else estimate.std_c_l
             away, uncertain = abs(ideal - u), SHORT * side_std * estimate.m
             # A step has to move x by a share of the tolerance, and to lessen what u is off.
-            if not (away * self.design.push > 0.25 * self.limit
-                    and away > max(1.5 * uncertain, noise)):
+            if not (away * plan.design.push > 0.25 * self.limit
+                    and away > max(1.5 * uncertain, plan.noise_band)):
                 return
             u_d, shrinkage = ideal, SHORT
         self.target = u_d, shrinkage

@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.control.inverse import BacklashInverse
-from backlash_ros.core.control.protocol import Command, ControlInput, ControlStructure
+from backlash_ros.core.control.structure import Command, ControlInput, ControlStructure
 from backlash_ros.core.control.tracking.design import TrackingDesign, better_design, design
 from backlash_ros.core.control.tracking.feedback import StateFeedback, shrunk_crossings
 from backlash_ros.core.control.tracking.rest import OFF, Rest
 from backlash_ros.core.control.tracking.trajectory import IdealTrajectory
 from backlash_ros.core.law import StateSource
+from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import TrackingWeights
 from backlash_ros.core.plant.backlash import Region
 from backlash_ros.core.plant.numerics import NoiseLevel
@@ -48,10 +49,10 @@ class Tracking(ControlStructure):
         noise_std: float = 0.0,
     ) -> None:
         self.delay = weights.preview
-        self._weights, self._design = weights, beginning
+        self._tuning = weights, shrinkage, noise_std
         self.trajectory = IdealTrajectory(beginning)
         self.feedback = StateFeedback(beginning, shrinkage, noise_std)
-        self.rest, self.hand_over = Rest(beginning), HandOver()
+        self.rest, self.hand_over = Rest(), HandOver()
         self._noise_std, self._y_noise = noise_std, NoiseLevel()
         self._moves = deque([0.0], maxlen=100)  # by which v moved of late, as sizes
         self._engaged_for = 0  # samples since v has crossed the gap
@@ -65,7 +66,7 @@ class Tracking(ControlStructure):
         # Samples after the first estimate, by then v has crossed the gap with it; after a crossing,
         # by then its last moves are over; in which u* must not turn or move v more than of late.
         settled_after, engaged_after, foreseen = 150, 5, 6
-        trust, plan = self.feedback.trust, self.trajectory.state
+        trust, plan = self.feedback.trust, self.trajectory
         if trust.in_use_for < settled_after or self._engaged_for < engaged_after:
             return False
         fastest, ahead = trust.slope * max(self._moves), plan.ahead[:foreseen + 1]
@@ -75,25 +76,27 @@ class Tracking(ControlStructure):
 
     # --- taking over ----------------------------------------------------------------------------
 
-    def go_on_from(self, other: ControlStructure, state_known: bool = True) -> None:
-        """Take over the trajectory, and the model of G that it is one of."""
-        if not isinstance(other, Tracking) or other.delay != self.delay:
-            return
-        self.trajectory, self.rest, self._newest = other.trajectory, other.rest, other._newest
-        self._moves, self._engaged_for = other._moves, other._engaged_for
-        model = other._design.model
-        self._use(self._design if model is self._design.model else design(model, self._weights))
-        self.feedback.go_on_from(other.feedback, state_known)
-        self.hand_over = HandOver(0.0, self.trajectory.state.u, not state_known, not state_known)
+    def restart(self) -> None:
+        self.feedback.restart()
+        self.hand_over = HandOver(due=self.trajectory.u, widens=True, leading=True)
+
+    def retune(self, p: Parameters, source: StateSource) -> None:
+        tuning = weights, shrinkage, noise_std = (
+            p.tracking, p.inverse.caution, p.estimator.output_noise_std)
+        if tuning != self._tuning:
+            gains, self._tuning = design(self.trajectory.design.model, weights), tuning
+            self.feedback.shrinkage, self.feedback.y_std = shrinkage, noise_std
+            self.adopt(gains, source)
 
     def redesign(self, model: StateModel) -> Callable[[], object | None]:
-        return partial(better_design, model, self._weights, self._design)
+        return partial(better_design, model, self._tuning[0], self.trajectory.design)
 
     def adopt(self, gains: object, source: StateSource) -> None:
         """Go on with a design as if it had been in use for as long as references are kept."""
         assert isinstance(gains, TrackingDesign)
         self.prepare()
-        self._use(gains)
+        self.trajectory.use(gains, self.trajectory.softness)
+        self.feedback.use(gains)
         self.feedback.prepare(source.x_cov, self._noise_std, *self.trajectory.noise)
         self._change_trajectory(source)
 
@@ -103,17 +106,12 @@ class Tracking(ControlStructure):
         if trajectory.references.empty:
             return
         trajectory.replay()
-        state, plan = replace(feedback.state), trajectory.state
-        deviation = feedback.deviation(source.x_hat, plan.x)
-        due = plan.u - feedback.u(deviation, False, self.rest.largest)[0]
+        state = replace(feedback.state)
+        deviation = feedback.deviation(source.x_hat, trajectory.x)
+        due = trajectory.u - feedback.u(deviation, False, self.rest.largest)[0]
         feedback.state = state  # this was no sample
-        self.hand_over = HandOver(due=due, widens=True)
+        self.hand_over = HandOver(due=due, widens=True, leading=self.hand_over.leading)
         trajectory.advance()  # the plant is at the next sample when the next command is made
-
-    def _use(self, chosen: TrackingDesign) -> None:
-        self._design = self.rest.design = chosen
-        self.trajectory.use(chosen, self.trajectory.softness)
-        self.feedback.use(chosen)
 
     # --- at every sample ------------------------------------------------------------------------
 
@@ -121,15 +119,15 @@ class Tracking(ControlStructure):
         """Return u_d and v = BI(u_d)."""
         y_m, y, estimate, source, crossing = inputs
         self.prepare()
-        feedback, rest, references = self.feedback, self.rest, self.trajectory.references
-        first, x_cov, hand_over = references.empty, source.x_cov, self.hand_over
+        plan, feedback, rest, hand_over = self.trajectory, self.feedback, self.rest, self.hand_over
+        first, x_cov = plan.references.empty, source.x_cov
         if first:
             # What may be noise is no distance to go: a loop at rest stays at rest.
-            self.trajectory.begin(y_m if abs(y - y_m) <= OFF * self._noise_std else y)
+            plan.begin(y_m if abs(y - y_m) <= OFF * self._noise_std else y)
         elif hand_over.leading:
-            self.trajectory.lead_to(y_m)
+            plan.lead_to(y_m)
         hand_over.leading = False
-        plan = self.trajectory.take(y_m)
+        plan.take(y_m)
         follows = not (rest.mode.steps or inverse.taking_up)
         if feedback.take(estimate, plan.u, first) and follows and hand_over.due is None:
             hand_over.due = inverse.extreme  # that led to v with the estimate before
@@ -139,8 +137,7 @@ class Tracking(ControlStructure):
                 hand_over.added += stands_for - hand_over.due
             hand_over.due = None
         deviation = feedback.deviation(source.x_hat, plan.x)
-        turned = self.trajectory.turn(
-            self._noise_std, feedback.gap_u, inverse.direction_band, crossing)
+        turned = plan.turn(self._noise_std, feedback.gap_u, inverse.direction_band, crossing)
         correction, worth = feedback.u(
             deviation, inverse.limited or inverse.taking_up, rest.largest)
         noise = 4.0 * feedback.noise_u + plan.noise_band
@@ -150,13 +147,12 @@ class Tracking(ControlStructure):
         added = hand_over.added
         hand_over.added *= FADING
         u_d += added
-        pull, before = rest.pull_back(deviation, feedback.bounds[0]), rest.mode
-        spread = max(references.high, y_m) - min(references.low, y_m) - references.noise_spread
-        mode = rest.decide(y, self._noise_std, references.window.item(0), spread, plan, deviation,
-                           None if x_cov is None else feedback.noise.x_std, inverse.side, pull,
+        pull, before = feedback.pull_back(deviation), rest.mode
+        mode = rest.decide(y, self._noise_std, plan, deviation,
+                           None if x_cov is None else feedback.x_std, inverse.side, pull,
                            abs(correction) > noise)
         if mode.steps and x_cov is not None:
-            rest.step(estimate, plan.u, plan.noise_band, pull, inverse, mode is not before)
+            rest.step(estimate, plan, pull, inverse, mode is not before)
         elif mode.steps and not before.steps:
             rest.stay(inverse)
         side = self._side(turned, u_d, noise, inverse)
@@ -172,7 +168,7 @@ class Tracking(ControlStructure):
         self._moves.append(abs(v - v_before))
         crosses = inverse.taking_up or inverse.side is not side_before
         self._engaged_for = 0 if crosses else self._engaged_for + 1
-        feedback.integrate(self._design.model.c * plan.x[0] - y, inverse.limited)
+        feedback.integrate(plan.design.model.c * plan.x[0] - y, inverse.limited)
         self._newest = y, x_cov, source
         return Command(u_d, v, 0.0)
 
@@ -196,7 +192,7 @@ class Tracking(ControlStructure):
         # What is behind the u that is held makes v cross the gap; what is beyond the furthest u*
         # comes back across it, and has to be more than noise. What is not must not go further than
         # feedback agrees with either, but for what hands v over.
-        plan, side, (c_r, c_l) = self.trajectory.state, inverse.side, self.feedback.trust.crossings
+        plan, side, (c_r, c_l) = self.trajectory, inverse.side, self.feedback.trust.crossings
         if side is Region.GAP or side is not plan.side or c_r == c_l:
             return worth
         held = inverse.held_u * side
@@ -214,7 +210,7 @@ class Tracking(ControlStructure):
         The trajectory has no noise and is known ahead, so it decides. Feedback may ask for the
         other side as well, where y is pushed, by more than the noise in u_d.
         """
-        plan, side, (c_r, c_l) = self.trajectory.state, inverse.side, self.feedback.trust.crossings
+        plan, side, (c_r, c_l) = self.trajectory, inverse.side, self.feedback.trust.crossings
         asked = plan.side
         if c_r == c_l and asked is not Region.GAP and u_d != inverse.held_u:
             return Region.RIGHT if u_d > inverse.held_u else Region.LEFT  # nothing is crossed

@@ -6,33 +6,127 @@ A turn of u* is seen before it comes. That decides on which side v is: once per 
 feedback is.
 """
 
-from dataclasses import dataclass, field
 from math import ceil, dist, isnan, nan
 
 import numpy as np
 
-from backlash_ros.core.control.tracking.design import TrackingDesign, dot
-from backlash_ros.core.control.tracking.preview import ReferenceWindow
+from backlash_ros.core.control.tracking.design import TrackingDesign, dot, parabolas
 from backlash_ros.core.plant.backlash import Region
+from backlash_ros.core.plant.numerics import NoiseLevel
 from backlash_ros.core.plant.transfer_function import Array, powers
 
 QUIET = 0.02  # share of the u that the gap takes, by which noise of the references may move u*
 
 
-@dataclass
-class TrajectoryState:
-    """Where the trajectory is, and where it goes."""
+class ReferenceWindow:
+    """r(k) .. r(k + N) without the noise of y_m, and `history` references before them; preview: N.
 
-    x: list[float]  # x*, shape (n,)
-    q: float = 0.0  # q*
-    side: Region = Region.GAP  # on which u* moves
-    extreme: float = nan  # furthest u* on it
-    decided: int = 0  # samples for which it stays
-    turns_in: int = 0  # samples until u* turns, or all that are known ahead
-    furthest: float = nan  # u* to which u goes without turning
-    ahead: list[float] = field(default_factory=lambda: [0.0])  # u* from this sample on
-    moved: float = 0.0  # by how much x* did
-    noise_band: float = 0.0  # how far noise of the references may turn u*
+    Each is replaced by the middle of a parabola through those around it, as many as are one but for
+    the noise; the newest N / 3 stay. noise_gains: deviation of u* for noise of 1 that was averaged
+    so, shape (widths,). u_noise_std: largest deviation of u* by what is left of the noise.
+    """
+
+    def __init__(self, preview: int, history: int, noise_gains: Array) -> None:
+        self.noise_gains = noise_gains
+        self._preview, self._kept = preview, history + preview + 1
+        self._fits, self._first, self._widths = parabolas(preview)
+        self._half = max(self._widths, default=0)
+        # As they came, as they are used, and what u* makes of noise of 1 in them. Written from the
+        # left to the right; when they are full their end moves to the front.
+        self._rows: Array = np.zeros((3, 2 * self._kept))
+        self._start = self._end = 0
+        self.noise = NoiseLevel()  # of the references as they came
+        self.u_noise_gain = float(noise_gains[0])
+        self.u_noise_std = self.noise_spread = self.low = self.high = 0.0
+
+    @property
+    def empty(self) -> bool:
+        return self._end == 0
+
+    @property
+    def window(self) -> Array:
+        """r(k) .. r(k + N), shape (N + 1,)."""
+        return self._rows[1, self._end - self._preview - 1:self._end]
+
+    def all(self) -> Array:
+        """Everything that is kept, the newest last, shape (up to history + N + 1,)."""
+        return self._rows[1, max(self._start, self._end - self._kept):self._end]
+
+    def fill(self, value: float) -> None:
+        """Let the window begin with this value everywhere."""
+        self._start, self._end = 0, self._preview + 1
+        self._rows[:2, :self._end] = value
+        self._rows[2, :self._end] = 0.0
+
+    def lead_to(self, value: float) -> None:
+        """Bend the window so that it leads to a value that is not what would have come next."""
+        window = self.window
+        jump = value - float(window[-1])
+        # What has become of the reference in between is not known; a jump would be taken for one.
+        if self._preview and abs(jump) > float(np.abs(np.diff(window)).max()):
+            self._rows[:2, self._end - len(window):self._end] += np.linspace(0.0, jump, len(window))
+
+    def append(self, value: float) -> None:
+        """Take in r(k + N)."""
+        self._rows[1, self._end] = value
+        self._end += 1
+
+    def settle(self) -> None:
+        """Make of the newest reference what only the next sample needs."""
+        newest, half = self._end - 1, self._half
+        self._rows[0, newest] = self._rows[1, newest]
+        self._rows[2, newest] = self.noise_gains[0]
+        self.noise.take(self._rows.item(0, newest))
+        std = self.noise.std
+        if half and std > 0.0 and newest - self._start >= 2 * half:
+            self._average(newest - half)
+        window = self.window
+        self.low, self.high = float(window.min()), float(window.max())
+        if std > 0.0:
+            self.noise_spread = 8.0 * std  # by as much it parts low and high at most
+            first = self._end - self._preview - 1
+            self.u_noise_gain = float(self._rows[2, first:max(self._end - half, first + 1)].max())
+            self.u_noise_std = std * self.u_noise_gain
+        if self._end == self._rows.shape[1]:
+            self._rows[:, :self._kept] = self._rows[:, -self._kept:]
+            self._start, self._end = 0, self._kept
+
+    def _average(self, at: int) -> None:
+        # Mean square of what is left beside a parabola, in those of the noise, up to which the
+        # references are taken for one, and from which on not: at a step, or a sharp turn.
+        one, none = 1.8, 3.0
+        widths, first = self._widths, self._first
+        rest = self._fits @ self._rows[0, at - self._half:at + self._half + 1]
+        of_noise = rest / self.noise.std  # its square may be too small for a number
+        squares = np.add.reduceat(of_noise * of_noise, first).tolist()
+        reference = value = self._rows.item(0, at)
+        gain = float(self.noise_gains[0])
+        for i, (w, row, square) in enumerate(zip(widths, first, squares, strict=True)):
+            share = min((none - square / (2 * w - 2)) / (none - one), 1.0)
+            if share > 0.0:
+                value += share * (reference - rest.item(row + w) - value)
+                gain += share * (self.noise_gains.item(i + 1) - gain)
+        self._rows[1, at], self._rows[2, at] = value, gain
+
+
+class IdealTrajectory:
+    """Follows the references, a sample at a time: `take`, `turn`, `prepare` for the next one.
+
+    x, q: x* (n,) and q*. ahead: u* from this sample on, shape (L,). side: on which u* moves, and
+    extreme, the furthest u* on it. turns_in: samples until u* turns, or all that are known ahead.
+    furthest: u* to which u goes without turning. moved: by how much x* did. spread: of the
+    references, beyond their noise.
+    """
+
+    def __init__(self, design: TrackingDesign) -> None:
+        self.x, self.q, self.ahead = [0.0] * design.model.order, 0.0, [0.0]
+        self.moved = self.spread = 0.0
+        self.side, self.extreme, self.furthest, self.turns_in = Region.GAP, nan, nan, 0
+        self._decided = 0  # samples for which the side stays
+        plan = design.plans[0]
+        self.references = ReferenceWindow(
+            len(plan.references[0]) - 1, design.model.memory, plan.noise_gains)
+        self.use(design)
 
     @property
     def u(self) -> float:
@@ -49,19 +143,15 @@ class TrajectoryState:
         """By how much u* has come back without having turned."""
         return max((self.extreme - self.u) * self.side, 0.0)
 
-
-class IdealTrajectory:
-    """Follows the references, a sample at a time: `take`, `turn`, `prepare` for the next one."""
-
-    def __init__(self, design: TrackingDesign) -> None:
-        self.state, plan = TrajectoryState([0.0] * design.model.order), design.plans[0]
-        self.references = ReferenceWindow(
-            len(plan.references[0]) - 1, design.model.memory, plan.noise_gains)
-        self.use(design)
+    @property
+    def noise_band(self) -> float:
+        """How far noise of the references may turn u*."""
+        # The highest of many samples before a turn is some three deviations above.
+        return 6.0 * self.references.u_noise_std
 
     def use(self, design: TrackingDesign, softness: int = 0) -> None:
         """Be this one of the trajectories of a design from the next sample on."""
-        self._design, self.softness, self._plan = design, softness, design.plans[softness]
+        self.design, self.softness, self._plan = design, softness, design.plans[softness]
         self.references.noise_gains = self._plan.noise_gains
         self._newest_gains: list[float] = self._plan.references[:, -1].tolist()
         self._due: list[float] | None = None  # u* ahead at the next sample, but for its reference
@@ -71,7 +161,7 @@ class IdealTrajectory:
     def soften(self, gap_u: float) -> bool:
         """Ask for less where noise of references makes u* cross a gap of this u; say if so."""
         # What each plan makes of noise that is averaged over the widest parabola.
-        of_noise = [plan.noise_gains.item(-1) for plan in self._design.plans]
+        of_noise = [plan.noise_gains.item(-1) for plan in self.design.plans]
         now, noise_std = of_noise[self.softness], self.references.noise.std
         if gap_u == 0.0 or noise_std * now <= QUIET * gap_u:
             return False
@@ -79,12 +169,12 @@ class IdealTrajectory:
                       of_noise.index(min(of_noise)))
         if of_noise[softer] > 0.5 * now:
             return False  # nothing is won: what moves u* is the reference itself
-        self.use(self._design, softer)
+        self.use(self.design, softer)
         return True
 
     def replay(self) -> None:
         """Be where this design would be, from rest at the oldest reference that is kept on."""
-        state, plan, model = self.state, self._plan, self._design.model
+        plan, model = self._plan, self.design.model
         # z(k+1) = F z(k) + [B; 0] u_p + [0; 1] r with u_p = -sum f_j r(k+j).
         n, references = model.order, self.references.all()
         inputs = np.zeros((n + 1, 2))
@@ -95,26 +185,27 @@ class IdealTrajectory:
         pairs = np.column_stack([by_preview[:steps], references[:steps]])[::-1]
         z = np.linalg.matrix_power(plan.closed, steps) @ start + np.einsum(
             'kij,kj->i', powers(plan.closed, inputs, steps), pairs)
-        state.x, state.q = z[:n].tolist(), float(z[n])
-        state.ahead = self._ahead(self.references.window)
+        self.x, self.q = z[:n].tolist(), float(z[n])
+        self.ahead = self._ahead(self.references.window)
 
     def begin(self, r: float) -> None:
         """Rest at y = r."""
         self.references.fill(r)
         self._due = None
-        self.state.x = (self._design.model.equilibrium * r).tolist()
+        self.x = (self.design.model.equilibrium * r).tolist()
 
     def lead_to(self, y_m: float) -> None:
         """Let the references lead to one that is not what would have come next."""
         self.references.lead_to(y_m)
         self._due = None
 
-    def take(self, y_m: float) -> TrajectoryState:
+    def take(self, y_m: float) -> None:
         """Take in r(k + N), so that u* is known for this sample and those ahead."""
-        due, r = self._due or self._ahead(self.references.window[1:]), float(y_m)
-        self.references.append(r)
-        self.state.ahead = [u + gain * r for u, gain in zip(due, self._newest_gains, strict=True)]
-        return self.state
+        references, r = self.references, float(y_m)
+        due = self._due or self._ahead(references.window[1:])
+        references.append(r)
+        self.spread = max(references.high, r) - min(references.low, r) - references.noise_spread
+        self.ahead = [u + gain * r for u, gain in zip(due, self._newest_gains, strict=True)]
 
     def turn(self, noise_std: float, gap_u: float, band: float, crossing: float) -> bool:
         """Decide on which side v is to be at this sample; returns whether it is another one.
@@ -122,38 +213,37 @@ class IdealTrajectory:
         noise_std: of y. gap_u: u that the gap takes. band: of u*, see `_turn`. crossing: samples
         that v takes across the gap; it leaves as much before the turn as it arrives after it.
         """
-        state, ahead = self.state, self.state.ahead
-        if isnan(state.extreme):
-            state.extreme = ahead[0]
-        before, taken, turns_in = state.side, ceil(crossing), 0
+        ahead, before, taken, turns_in = self.ahead, self.side, ceil(crossing), 0
+        if isnan(self.extreme):
+            self.extreme = ahead[0]
         arrival = max(taken - 1, 0)
         # What moves y by less than its noise is no turn, unless it is a hundredth of the gap.
-        least = min(noise_std / self._design.push_ahead, 0.01 * gap_u)
-        noise = max(least, state.noise_band)
-        if state.decided > 0:
-            state.decided -= 1
+        least = min(noise_std / self.design.push_ahead, 0.01 * gap_u)
+        noise = max(least, self.noise_band)
+        if self._decided > 0:
+            self._decided -= 1
         elif before is Region.GAP:
-            moves = [u - state.extreme for u in ahead]
+            moves = [u - self.extreme for u in ahead]
             if max(map(abs, moves[:arrival + 1])) > least:
                 first = next((move for move in moves if abs(move) > noise), 0.0)
-                state.side = Region((first > 0.0) - (first < 0.0))
+                self.side = Region((first > 0.0) - (first < 0.0))
         else:
-            peak = _turn(ahead, state.extreme, before, noise, band, taken)
+            peak = _turn(ahead, self.extreme, before, noise, band, taken)
             turns_in = len(ahead) if peak is None else max(peak, 0)
             later = ahead[min(arrival, len(ahead) - 1)]
-            if peak is not None and peak < taken and (later - state.extreme) * before <= 0.0:
-                state.side = Region(-before)
-                state.extreme, state.decided = later, arrival
-        if (ahead[0] - state.extreme) * state.side > 0.0 and not state.decided:
-            state.extreme = ahead[0]
-        state.turns_in = turns_in if state.side is before else 0
-        most, least_of = (max, min) if state.side is Region.RIGHT else (min, max)
-        state.furthest = most(ahead)
-        if state.turns_in == len(ahead) \
-                and least_of(ahead[ahead.index(state.furthest):]) != ahead[-1]:
+            if peak is not None and peak < taken and (later - self.extreme) * before <= 0.0:
+                self.side = Region(-before)
+                self.extreme, self._decided = later, arrival
+        if (ahead[0] - self.extreme) * self.side > 0.0 and not self._decided:
+            self.extreme = ahead[0]
+        self.turns_in = turns_in if self.side is before else 0
+        most, least_of = (max, min) if self.side is Region.RIGHT else (min, max)
+        self.furthest = most(ahead)
+        if self.turns_in == len(ahead) \
+                and least_of(ahead[ahead.index(self.furthest):]) != ahead[-1]:
             # A swing that is no turn, and over: it is not followed there and back.
-            state.furthest = ahead[-1]
-        return state.side is not before
+            self.furthest = ahead[-1]
+        return self.side is not before
 
     @property
     def noise(self) -> tuple[Array, float]:
@@ -163,24 +253,22 @@ class IdealTrajectory:
 
     def advance(self) -> None:
         """Go on to the next sample."""
-        state, before = self.state, self.state.x
-        state.q += self.references.window.item(0) - self._design.model.c * before[0]
-        state.x = [dot(row, before) + b * state.u for row, b in self._transition]
-        state.moved = dist(state.x, before)
+        before = self.x
+        self.q += self.references.window.item(0) - self.design.model.c * before[0]
+        self.x = [dot(row, before) + b * self.u for row, b in self._transition]
+        self.moved = dist(self.x, before)
 
     def prepare(self) -> None:
         """Do what the next sample needs, and its reference does not change."""
         self.advance()
         self.references.settle()
-        # The highest of many samples before a turn is some three deviations above.
-        self.state.noise_band = 6.0 * self.references.u_noise_std
         self._due = self._ahead(self.references.window[1:])
 
     def _ahead(self, references: Array) -> list[float]:
         """u* from [x*; q*] and these references on, as many as there are."""
         gains = self._plan.references[:, :len(references)]
-        ahead = self._plan.states @ [*self.state.x, self.state.q] + gains @ references
-        return [float(u) for u in ahead]
+        ahead: list[float] = (self._plan.states @ [*self.x, self.q] + gains @ references).tolist()
+        return ahead
 
 
 def _turn(

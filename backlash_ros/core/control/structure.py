@@ -1,19 +1,80 @@
-"""The structures of the papers: u_d = y_m + f v (3.2), and the four blocks of Tao and Kokotović."""
+"""The structures turn y_m into u_d and v: what each offers, and those of the papers.
 
+u_d = y_m + f v (3.2), and the four blocks of Tao and Kokotović; `tracking` stands beside.
+"""
+
+from collections.abc import Callable
 from math import hypot, inf
+from typing import NamedTuple
 
 import numpy as np
 
-from backlash_ros.core.control import protocol
 from backlash_ros.core.control.inverse import BacklashInverse
-from backlash_ros.core.control.protocol import Command, ControlInput, ControlStructure
 from backlash_ros.core.estimate import Estimate, Status
+from backlash_ros.core.law import StateSource
+from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.backlash import Region
 from backlash_ros.core.plant.numerics import FourBlocks
-from backlash_ros.core.plant.transfer_function import Array
+from backlash_ros.core.plant.transfer_function import Array, StateModel
 
 # (m - f) divides: f beyond this share of m would multiply every error in m by more than five.
 LARGEST_F_OVER_M = 0.8
+# Largest feedback, whatever y does, in units of the u that the reference has asked for so far or
+# that the gap takes: while the backlash is unknown, as wrong as a first guess may be; later what
+# leads y back from where it has gone until then.
+LARGEST_IN_ACQUISITION, LARGEST_FEEDBACK = 10.0, 100.0
+
+
+class ControlInput(NamedTuple):
+    """What is known at a sample."""
+
+    y_m: float
+    y: float
+    estimate: Estimate
+    source: StateSource
+    crossing: float = 0.0  # samples that v takes across the gap, by its limits
+
+
+class Command(NamedTuple):
+    """Desired input u_d of G, the control v that shall cause it, and the gain f in use."""
+
+    u_d: float
+    v: float
+    f: float
+
+
+class ControlStructure:
+    """Makes u_d from the reference and drives the inverse with it.
+
+    Structures inherit from here what a better G does not change.
+    """
+
+    delay: int = 0  # samples by which y is meant to follow y_m
+
+    @property
+    def may_change(self) -> bool:
+        """Whether gains for a better G may take over at this sample."""
+        return True
+
+    def control(self, inputs: ControlInput, inverse: BacklashInverse) -> Command:
+        """Return the command of this sample; advances the inverse by one step."""
+        raise NotImplementedError
+
+    def prepare(self) -> None:
+        """Do what the next command need not wait for; the next one does it where nobody asks."""
+
+    def redesign(self, model: StateModel) -> Callable[[], object | None] | None:
+        """What makes gains for a better G in any process, or None if unsafe; None: none to make."""
+        return None
+
+    def adopt(self, gains: object, source: StateSource) -> None:
+        """Use such gains from the next sample on, without a jump of v; source: of their x_hat."""
+
+    def restart(self) -> None:
+        """Go on although x_hat begins anew, and the reference may have gone on meanwhile."""
+
+    def retune(self, p: Parameters, source: StateSource) -> None:
+        """Take up new values of live parameters from the next sample on; source: as in `adopt`."""
 
 
 class Proportional(ControlStructure):
@@ -25,10 +86,6 @@ class Proportional(ControlStructure):
 
     def __init__(self) -> None:
         self._estimate: Estimate | None = None  # that v was made with
-
-    def go_on_from(self, other: ControlStructure, state_known: bool = True) -> None:
-        if isinstance(other, Proportional):
-            self._estimate = other._estimate
 
     def control(self, inputs: ControlInput, inverse: BacklashInverse) -> Command:
         """Return u_d and v that satisfy (3.2) and (2.3) together."""
@@ -102,11 +159,6 @@ class PolePlacement(ControlStructure):
         self._largest_asked = 0.0  # largest of it so far
         self.delay = round(blocks.reference.group_delay)
 
-    def go_on_from(self, other: ControlStructure, state_known: bool = True) -> None:
-        if isinstance(other, PolePlacement) and other._w.shape == self._w.shape:
-            self._w = other._w
-            self._r, self._asked, self._largest_asked = other._r, other._asked, other._largest_asked
-
     def control(self, inputs: ControlInput, inverse: BacklashInverse) -> Command:
         """Return u_d, no further than feedback may go from what r asks for, and v = BI(u_d)."""
         blocks, e, (w_1, w_2) = self._blocks, inputs.estimate, self._w
@@ -117,8 +169,8 @@ class PolePlacement(ControlStructure):
         asked = float(numerator @ self._r - denominator[1:] @ self._asked)
         self._asked = np.append(asked, self._asked)[:-1]
         self._largest_asked = max(self._largest_asked, abs(asked))
-        share = protocol.LARGEST_FEEDBACK if e.status is Status.TRACKING else \
-            protocol.LARGEST_IN_ACQUISITION
+        share = LARGEST_FEEDBACK if e.status is Status.TRACKING else \
+            LARGEST_IN_ACQUISITION
         reach = share * max(self._largest_asked, e.m * (e.c_r - e.c_l))
         u_d = min(max(u_d, asked - reach), asked + reach)
         v = inverse.step(u_d, e.m, e.c_r, e.c_l)
