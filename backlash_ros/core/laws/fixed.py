@@ -9,7 +9,7 @@ import numpy as np
 
 from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.law import Interval, Law
-from backlash_ros.core.plant.backlash import Backlash
+from backlash_ros.core.plant.backlash import clamp
 from backlash_ros.core.plant.numerics import NoiseLevel
 from backlash_ros.core.plant.transfer_function import Array, StateModel
 
@@ -27,11 +27,9 @@ class FixedBacklash(Law):
     def __init__(
         self, initial: Estimate, model: StateModel, noise_std: float, doubt: float,
     ) -> None:
-        self.estimate = e = replace(
+        self.estimate = replace(
             initial, std_m=0.0, std_c_r=0.0, std_c_l=0.0, status=Status.TRACKING)
         n = model.order
-        # A gap of exactly 0 has c_l = c_r, which (2.1) does not know: then u = m (v - c).
-        self._backlash = None if e.c_r == e.c_l else Backlash(e.m, e.c_r, e.c_l)
         self._model, self._doubt = model, doubt
         self._transition = np.eye(n + 1)
         self._transition[:n, :n], self._transition[:n, n] = model.a, model.b
@@ -64,8 +62,8 @@ class FixedBacklash(Law):
         return self._model.c * float(self._transition[0] @ self._x + self._model.b[0] * u)
 
     def update(self, y: float | None, interval: Interval) -> None:
-        e, backlash, before = self.estimate, self._backlash, self._u
-        self._u = e.m * (interval.v - e.c_r) if backlash is None else backlash.step(interval.v)
+        e, v, before = self.estimate, interval.v, self._u
+        self._u = clamp(before, e.m * (v - e.c_r), e.m * (v - e.c_l))
         x = self._transition @ self._x
         x[:-1] += self._model.b * self._u
         p = self._transition @ self._p @ self._transition.T

@@ -28,21 +28,6 @@ from backlash_ros.core.plant.numerics import FourBlocks
 from backlash_ros.core.plant.transfer_function import Array
 
 
-class Filters:
-    """W of phi and of u_d, and what returns of y, side by side in observer form."""
-
-    def __init__(self, blocks: FourBlocks) -> None:
-        models = [*[blocks.disturbance.state_space()] * 4, blocks.returned.state_space()]
-        self.a, self.b = models[0][0], np.column_stack([b for _, b, _ in models])
-        self.x: Array = np.zeros(self.b.shape)
-
-    def step(self, inputs: Array) -> Array:
-        """Outputs (5,) after phi, u_d and y (5,)."""
-        self.x = self.a @ self.x + self.b * inputs
-        row: Array = self.x[0]
-        return row
-
-
 class GradientEstimator(Law):
     """Learns (m, m c_r, m c_l) from y behind the filters of the four-block loop.
 
@@ -58,10 +43,13 @@ class GradientEstimator(Law):
         self.estimate, self.step = initial, step
         self._bounds, self._noise_square = bounds, (10.0 * noise_std) ** 2
         self._agreement = Agreement()
-        self._filters = Filters(blocks)
+        # W of phi and of u_d, and what returns of y, side by side in observer form.
+        filters = [*[blocks.disturbance.state_space()] * 4, blocks.returned.state_space()]
+        self._a, self._b = filters[0][0], np.column_stack([b for _, b, _ in filters])
+        self._x: Array = np.zeros(self._b.shape)
         self._y = 0.0  # the newest one, or what was expected of it
         self._phi: Array = np.zeros(3)
-        self._means = [0.0, 0.0, 0.0]  # of v^2, u_d^2 and zeta' P zeta
+        self._v_square = self._u_square = self._size = 0.0  # means, the last of zeta' P zeta
         self._samples = 0
 
     def update(self, y: float | None, interval: Interval) -> None:
@@ -69,34 +57,32 @@ class GradientEstimator(Law):
         self._phi = self._engaged(interval, old)
         theta = np.array([old.m, old.m * old.c_r, old.m * old.c_l])
         self.u_hat = float(theta @ self._phi)
-        *of_phi, demanded, returned = self._filters.step(
-            np.concatenate((self._phi, (interval.u_d, self._y)))).tolist()
+        inputs = np.concatenate((self._phi, (interval.u_d, self._y)))
+        self._x = self._a @ self._x + self._b * inputs
+        *of_phi, demanded, returned = self._x[0].tolist()
         zeta = np.array(of_phi)
         self._samples += 1
         share = 1.0 / min(self._samples, MEMORY)
-        v_square, u_square, mean_size = self._means
-        v_square += share * (interval.v**2 - v_square)
-        u_square += share * (interval.u_d**2 - u_square)
-        self._means[:2] = v_square, u_square
+        self._v_square += share * (interval.v**2 - self._v_square)
+        self._u_square += share * (interval.u_d**2 - self._u_square)
         expected = float(theta @ zeta) - returned
         if y is None:
             self.innovation, self._y = nan, expected
             return
-        self._y, eps = y, y - expected
-        self.innovation = eps
-        if min(v_square, u_square) < LEAST_SQUARE:
+        self._y, self.innovation = y, y - expected
+        if min(self._v_square, self._u_square) < LEAST_SQUARE:
             return
         xi = float(theta @ zeta - demanded)
-        scaled = zeta * np.array([1.0 / v_square, 1.0, 1.0])
+        scaled = zeta * np.array([1.0 / self._v_square, 1.0, 1.0])
         size = float(zeta @ scaled)
-        mean_size += share * (size - mean_size)
-        self._means[2] = mean_size
-        norm = size + max(0.1 * mean_size, self._noise_square / u_square) + xi**2 / u_square
+        self._size += share * (size - self._size)
+        least = max(0.1 * self._size, self._noise_square / self._u_square)
+        norm = size + least + xi**2 / self._u_square
         if norm == 0.0 or not self.adapting:
             return
         new = old
         if old.status is not Status.INCONSISTENT:
-            theta = theta + (self.step * eps / norm) * scaled
+            theta = theta + (self.step * self.innovation / norm) * scaled
             new = Estimate(*self._bounds.of_products(*theta.tolist()), old.f)
         self.estimate = self._agreement.judged(new, (*zeta.tolist(), y + returned))
 

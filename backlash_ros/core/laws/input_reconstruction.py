@@ -1,4 +1,4 @@
-"""u from y alone, and the laws that learn from it.
+"""u from y alone, and whether estimates agree with it.
 
 A fixed-lag Kalman smoother of a random walk u(k+1) = u(k) + w in front of G. Looking back makes the
 inversion stable: an unstable zero z0 is inverted backwards in time, where it decays like |z0|^-lag.
@@ -11,29 +11,21 @@ R = E{phi phi'} over many samples, and phi scaled to E{phi_i^2} = 1, the estimat
     |theta - theta_hat|^2 <= E{(t - theta_hat' phi)^2} / (smallest eigenvalue of R)
 """
 
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 from math import inf, nan, sqrt
 
 import numpy as np
 
-from backlash_ros.core.estimate import Bounds, Estimate, Status
-from backlash_ros.core.law import Interval, Law
+from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.parameters import ParameterError
-from backlash_ros.core.plant.transfer_function import (
-    Array,
-    StateModel,
-    TransferFunction,
-    check_model,
-)
+from backlash_ros.core.plant.transfer_function import Array, StateModel, TransferFunction
 
 # Square of a signal below which it counts as none. Its inverse, times the square of any
 # measurement, still is a number.
 LEAST_SQUARE = 1e-240
 MEMORY = 200  # samples over which means are taken, with weights that fade
 LEAST_SAMPLES, EVERY = 100, 20  # before the first judgement, and from one to the next
-STROKE = 8  # samples to either side over which u moves on in one direction
 
 
 class InputReconstruction:
@@ -46,7 +38,6 @@ class InputReconstruction:
     def __init__(
         self, model: TransferFunction, noise_std: float, lag: int, smoothed: float = 1.0,
     ) -> None:
-        check_model(model)
         if lag < model.delay:
             raise ParameterError(
                 'estimator.lag', lag, f'must be >= {model.delay}', 'G(z) delays u by as much')
@@ -207,59 +198,3 @@ class Agreement:
         """Mean of (t - theta' phi)^2."""
         weights = np.append(-theta, 1.0)
         return max(float(weights @ self._products @ weights), 0.0)
-
-
-class LaggedLaw(Law):
-    """Learns from u reconstructed some samples late, and what was applied when it acted."""
-
-    def __init__(
-        self, initial: Estimate, bounds: Bounds, f_bounds: tuple[float, float],
-        reconstruction: InputReconstruction,
-    ) -> None:
-        self.estimate, self._bounds, self._f_bounds = initial, bounds, f_bounds
-        self._reconstruction = reconstruction
-        self._applied: deque[Interval] = deque(maxlen=reconstruction.lag)
-        self._past: deque[float] = deque([0.0, 0.0], maxlen=STROKE + 1)
-        self._agreement = Agreement()
-
-    @property
-    def u_hat(self) -> float:
-        return self._reconstruction.u_hat
-
-    @property
-    def x_hat(self) -> Array:
-        return self._reconstruction.x_hat
-
-    @property
-    def innovation(self) -> float:
-        return self._reconstruction.innovation
-
-    def update(self, y: float | None, interval: Interval) -> None:
-        """Take in y(k) and learn from the sample that the reconstruction has reached."""
-        u = self._reconstruction.update(y)
-        self._past.append(u)
-        self._applied.append(interval)  # the newest carried u(k-1), the oldest u(k-lag)
-        if not (self.adapting and self._reconstruction.ready):
-            return
-        past, rising = self._applied[0], self._rising(u)
-        self.estimate = self._learned(u, past, rising)
-        if rising is not None:
-            row = (past.v, -1.0, 0.0, u) if rising else (past.v, 0.0, -1.0, u)
-            self.estimate = self._agreement.judged(self.estimate, row)
-
-    def _learned(self, u: float, past: Interval, rising: bool | None) -> Estimate:
-        raise NotImplementedError
-
-    def _rising(self, u: float) -> bool | None:
-        """Whether u moves on the right line (True) or the left one; None where it may rest.
-
-        It counts as moving by two deviations of its error, as smoothing rounds the corners, and at
-        no less than a quarter of the mean pace of the stroke.
-        """
-        ahead, behind = self._reconstruction.newer(STROKE) - u, u - self._past[0]
-        step, rising = u - self._past[-2], True
-        if min(ahead, behind, step) < 0.0:
-            ahead, behind, step, rising = -ahead, -behind, -step, False
-        slowest = min(ahead, behind)
-        resting = slowest <= 2.0 * self._reconstruction.std or step < 0.25 * slowest / STROKE
-        return None if resting else rising
