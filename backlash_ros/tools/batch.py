@@ -34,15 +34,9 @@ OUTCOME_COLUMNS = (
     *(f'{prefix}{name}' for prefix in OUTCOME_GROUPS for name in BACKLASH),
     'control_error_rms', 'tracking_error_rms', 'lost_samples', 'problem',
 )
+Job = tuple[Parameters, int]  # one run: its parameters and its length in samples
 # What a run came to, under OUTCOME_COLUMNS; problem: why it broke off, '' where it did not.
 Outcome = Mapping[str, float | str | None]
-
-
-class Job(NamedTuple):
-    """One run: its complete parameters and its length."""
-
-    values: Mapping[str, Value]
-    samples: int
 
 
 class ParameterStatistics(NamedTuple):
@@ -85,16 +79,16 @@ def make_jobs(
         changed = parameters.replaced(change)
         samples = cli.number_of_samples(changed, duration)
         build_closed_loop(changed)
-        jobs += [Job(dict(changed.replaced({'seed': seed})), samples)
+        jobs += [(changed.replaced({'seed': seed}), samples)
                  for seed in ([changed.seed] if 'seed' in change else seeds)]
     return jobs
 
 
 def run_job(job: Job) -> Outcome:
     """Simulate one run; a run that breaks off is an outcome too."""
-    parameters = Parameters(job.values)
+    parameters, samples = job
     try:
-        summary = summarise(run_loop(build_closed_loop(parameters), job.samples), parameters)
+        summary = summarise(run_loop(build_closed_loop(parameters), samples), parameters)
     except BrokenOffError as error:
         return {**dict.fromkeys(OUTCOME_COLUMNS), 'problem': str(error)}
     summary |= {f'{prefix}{name}': summary[group][name]

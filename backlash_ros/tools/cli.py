@@ -136,17 +136,15 @@ class StopRequests:
     What follows within 0.2 s does not count: a Ctrl-C may come from two sides.
     """
 
-    def __init__(self) -> None:
-        self.count = 0
-        self.last = ''
-        self._came_at_s = -inf
-        self._before: dict[int, Any] = {}
+    count, last, _came_at_s = 0, '', -inf
 
     def __enter__(self) -> 'StopRequests':
-        for caught in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        self._before = {
+            caught: signal.signal(caught, self._note)
+            for caught in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
             # Under nohup a hang-up stays ignored.
-            if caught != signal.SIGHUP or signal.getsignal(caught) is not signal.SIG_IGN:
-                self._before[caught] = signal.signal(caught, self._note)
+            if caught != signal.SIGHUP or signal.getsignal(caught) is not signal.SIG_IGN
+        }
         return self
 
     def __exit__(self, *error: object) -> None:

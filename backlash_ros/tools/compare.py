@@ -2,7 +2,7 @@
 
 import argparse
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from string import Template
@@ -22,6 +22,7 @@ from backlash_ros.tools.config import effective_parameters
 from backlash_ros.tools.runs.files import result_directory
 from backlash_ros.tools.runs.read_run import run_loop
 from backlash_ros.tools.runs.summary import ErrorCurves, moving_rms
+from backlash_ros.topics import BACKLASH
 
 COMPARISON_HEADER = (
     'loop', 'control error', 'tracking error', 'backlash penalty', 'total variation of v',
@@ -40,46 +41,43 @@ class Result(NamedTuple):
     note: str = ''
 
 
-def contenders(scenario: Parameters) -> dict[str, dict[str, object]]:
-    """What sets the loops apart, by name, from the paper's to the one without a backlash."""
-    m, c_r, c_l = (getattr(scenario.backlash, name) for name in ('m', 'c_r', 'c_l'))
-    tracks = {'structure': 'tracking', 'fixed.doubt': 0.5}
+def contenders(scenario: Parameters) -> dict[str, Parameters]:
+    """The loops by name, from the paper's to the one without a backlash."""
+    m, c_r, c_l = (getattr(scenario.backlash, name) for name in BACKLASH)
+    # Saved estimates would favour the law that they are of.
+    paper = scenario.replaced({'structure': 'proportional', 'estimates.load': False})
+    # y_m is scaled by |G| at its frequency, so that every loop asks for the same motion of G.
+    z = np.exp(1j * scenario.frequency * scenario.sample_period)
+    gain = abs(complex(build_model(scenario).response(np.array([z]))[0]))
+    tracking = paper.replaced({'structure': 'tracking', 'amplitude': gain * scenario.amplitude,
+                               'bias': gain * scenario.bias})
+    doubtful = tracking.replaced({'fixed.doubt': 0.5})
     return {
-        **{f'{law}, u_d = y_m + f v': {'structure': 'proportional', 'estimator.law': law}
+        **{f'{law}, u_d = y_m + f v': paper.replaced({'estimator.law': law})
            for law in ('printed', 'lms', 'moving_horizon')},
-        'gradient, four blocks': {
+        'gradient, four blocks': tracking.replaced({
             'structure': 'pole_placement', 'estimator.law': 'gradient',
             # With less, y, which they feed back unfiltered, has to be less noisy.
             'tracking.input_weight': 1.0,
-        },
-        'moving_horizon, tracking': {'structure': 'tracking', 'estimator.law': 'moving_horizon'},
-        'wrong constants, tracking': {**tracks, **_fixed(m, 1.3 * c_r, 1.3 * c_l)},
-        'no compensation, tracking': {**tracks, **_fixed(m, 0.0, 0.0)},
-        'no backlash, tracking': {'structure': 'tracking', **_fixed(m, 0.0, 0.0), **GAPLESS},
+        }),
+        'moving_horizon, tracking': tracking.replaced({'estimator.law': 'moving_horizon'}),
+        'wrong constants, tracking': _fixed(doubtful, m, 1.3 * c_r, 1.3 * c_l),
+        'no compensation, tracking': _fixed(doubtful, m),
+        'no backlash, tracking': _fixed(tracking.replaced(GAPLESS), m),
     }
 
 
-def _fixed(m: float, c_r: float, c_l: float) -> dict[str, object]:
-    return {'estimator.law': 'fixed', 'estimator.initial.m': m, 'estimator.initial.c_r': c_r,
-            'estimator.initial.c_l': c_l, 'estimates.load': False}
+def _fixed(p: Parameters, m: float, c_r: float = 0.0, c_l: float = 0.0) -> Parameters:
+    return p.replaced({'estimator.law': 'fixed', 'estimator.initial.m': m,
+                       'estimator.initial.c_r': c_r, 'estimator.initial.c_l': c_l})
 
 
 def compare(scenario: Parameters, samples: int) -> list[Result]:
     bar = tqdm(contenders(scenario).items(), desc='compare', unit='loop', disable=None)
-    return [_measure(name, scenario, changes, samples) for name, changes in bar]
+    return [_measure(name, p, samples) for name, p in bar]
 
 
-def _measure(
-    name: str, scenario: Parameters, changes: Mapping[str, object], samples: int,
-) -> Result:
-    p = scenario.replaced(changes)
-    if p.estimator.law != scenario.estimator.law:
-        p = p.replaced({'estimates.load': False})  # they belong to another law
-    follows = p.structure != 'proportional'  # else y_m sets u_d
-    if follows:  # scaled by |G| at its frequency, so that every loop asks for the same motion of G
-        z = np.exp(1j * scenario.frequency * scenario.sample_period)
-        gain = abs(complex(build_model(scenario).response(np.array([z]))[0]))
-        p = p.replaced({'amplitude': gain * scenario.amplitude, 'bias': gain * scenario.bias})
+def _measure(name: str, p: Parameters, samples: int) -> Result:
     loop = build_closed_loop(p)
     delay = loop.controller.structure.delay
     try:
@@ -88,12 +86,11 @@ def _measure(
         return Result(name, note=str(broken))
     t, since = run.column('t'), 0.2 * run.samples * run.sample_period
     error = penalty = tracking = None
-    if follows:
+    if p.structure != 'proportional':  # where y_m sets u_d
         tracking = moving_rms(
             run.column('y') - run_record.delayed_reference(run, delay), run.sample_period)
-        gapless = run_loop(build_closed_loop(p.replaced({
-            **GAPLESS, **_fixed(p.backlash.m, 0.0, 0.0), 'fixed.doubt': 0.0,
-        })), samples)
+        gapless = run_loop(build_closed_loop(_fixed(
+            p.replaced({**GAPLESS, 'fixed.doubt': 0.0}), p.backlash.m)), samples)
         error, best = (run_record.delayed_tracking_error_rms(each, delay, since)
                        for each in (run, gapless))
         penalty = None if error is None or best is None else error - best
@@ -123,10 +120,9 @@ def _compare(args: Sequence[str] | None) -> None:
     curves = [result.curves for result in results if result.curves is not None]
     write_atomically(out / figure, png(draw_error_curves(curves)))
     template = Template(Path(__file__).with_name('comparison.md').read_text(encoding='utf-8'))
-    numbers = {'frequency': scenario.frequency, 'noise': scenario.output_noise_std,
-               **scenario.backlash._asdict()}
+    numbers = {name: f'{getattr(scenario.backlash, name):g}' for name in BACKLASH}
     write_atomically(document, template.substitute(
-        {name: f'{value:g}' for name, value in numbers.items() if isinstance(value, float)},
+        numbers, frequency=f'{scenario.frequency:g}', noise=f'{scenario.output_noise_std:g}',
         figure=figure, waveform=scenario.waveform, header=' | '.join(COMPARISON_HEADER),
         rule='|---' * len(COMPARISON_HEADER),
         rows='\n'.join(f'| {" | ".join(row)} |' for row in rows),

@@ -9,7 +9,7 @@ from math import inf
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.loop.diagnosis import Learning, LoopFigures, Neighbours, state_beside
 from backlash_ros.core.loop.sample_counter import Timing
-from backlash_ros.core.parameters import Parameters, Value, as_yaml
+from backlash_ros.core.parameters import Parameters, as_yaml
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.options import OptionParser
 from backlash_ros.tools import batch, cli
@@ -79,9 +79,8 @@ def _many(parameters: Parameters, options: argparse.Namespace) -> None:
     write_config(parameters, directory / CONFIG_FILE)
     csv = directory / ('sweep.csv' if swept else 'seeds.csv')
     write_table(csv, (*swept, 'seed', *batch.OUTCOME_COLUMNS), [
-        [*(list(value) if isinstance(value := job.values[name], tuple) else value
-           for name in (*swept, 'seed')), *outcome.values()]
-        for job, outcome in zip(jobs, outcomes, strict=True)])
+        [*(as_yaml(run[name]) for name in (*swept, 'seed')), *outcome.values()]
+        for (run, _), outcome in zip(jobs, outcomes, strict=True)])
     size = len(outcomes) // len(changes)  # the jobs of one change stand together
     rows = []
     for i, change in enumerate(changes):
@@ -96,12 +95,12 @@ def _many(parameters: Parameters, options: argparse.Namespace) -> None:
         ] for name, s in batch.statistics(group).items()]
     print(cli.format_table([*swept, '', 'bias', 'RMSE', 'settled, median', 'settled, last',
                             'within 1 %'], rows))
-    named: dict[str, list[Value]] = {}
-    for job, outcome in zip(jobs, outcomes, strict=True):
-        if outcome['problem'] or None in [outcome[f'settling_{name}'] for name in BACKLASH]:
-            what = f'broke off ({outcome["problem"]})' if outcome['problem'] else \
-                'not within 1 % at the end'
-            named.setdefault(what, []).append(job.values['seed'])
+    named: dict[str, list[int]] = {}
+    for (run, _), outcome in zip(jobs, outcomes, strict=True):
+        if outcome['problem']:
+            named.setdefault(f'broke off ({outcome["problem"]})', []).append(run.seed)
+        elif None in [outcome[f'settling_{name}'] for name in BACKLASH]:
+            named.setdefault('not within 1 % at the end', []).append(run.seed)
     for what, of in named.items():
         print(f'{what}: {len(of)} runs, seed {", ".join(map(str, dict.fromkeys(of)))}')
     print(f'runs: {csv}')

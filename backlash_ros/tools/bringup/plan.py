@@ -34,9 +34,9 @@ class Axis:
     """One controller of a run, and how far it has come; name: also its namespace.
 
     Its parameters are complete and checked: samples is 0 without end, driver empty for the
-    simulated plant. made: samples since number first. began, moved, next_line: on the monotonic
-    clock [s]. published: samples and messages by topic of a simulated plant that is done; heard:
-    those of them that the recorder has.
+    simulated plant. made: samples since number first. moved, next_line: on the monotonic clock [s].
+    published: samples and messages by topic of a simulated plant that is done; heard: those of them
+    that the recorder has.
     """
 
     name: str
@@ -44,7 +44,6 @@ class Axis:
     out: Path
     made: int = 0
     first: int = 0
-    began: float = field(default_factory=time.monotonic)
     moved: float = field(default_factory=time.monotonic)
     next_line: float = 0.0
     published: Mapping[str, int] | None = None
@@ -73,9 +72,8 @@ class Axis:
 
     def take(self, progress: Mapping[str, Any]) -> None:
         sample, p, now = progress['sample'], self.parameters, time.monotonic()
-        if self.made == 0:
-            # A driver may have been running before; a simulated plant begins with sample 0.
-            self.began, self.first = now, sample if p.driver else 0
+        if p.driver and self.made == 0:  # it may have been running before
+            self.first = sample
         made = sample + 1 - self.first
         self.heard = {'samples': made, **progress.get('received', {})}
         if made <= self.made:
@@ -83,7 +81,7 @@ class Axis:
         self.made, self.moved, self.silent = made, now, False
         if now >= self.next_line:
             # Every 2 s, and ever more seldom, so that a run of days does not fill the disk.
-            self.next_line = now + max(2.0, 0.05 * (now - self.began))
+            self.next_line = now + max(2.0, 0.05 * made * p.sample_period)
             words = [f'{made * p.sample_period:7.2f} s', f'{made}/{p.samples or "∞"}', *(
                 f'{name} {cli.number(progress.get(name))}' for name in topics.BACKLASH
             ), f'lost {progress.get("lost", 0)}']
@@ -99,22 +97,20 @@ class Axis:
         if self.complete or self.silent or time.monotonic() < self.moved + patience \
                 or (waits and not self.made):
             return
-        if unready:
-            hint = ' (a controller waits until the driver subscribes to its command)' \
-                if p.driver else ''
-            raise BrokenOffError('\n'.join([
-                f'not ready within {patience:g} s: '
-                f'{", ".join(child.name for child in unready)}{hint}',
-                *(f'the end of {child.end_of_log()}' for child in unready)]))
-        at = f' after sample {self.first + self.made - 1}' if self.made else ''
-        silence = self.titled(f'no new sample for {patience:g} s{at}')
-        if not (p.driver and self.made):
-            cure = ': does the driver publish its output? Where it needs longer, start it ' \
-                   'yourself (--driver none)' if p.driver else ''
-            raise BrokenOffError(f'{silence}{cure}, see {self.logs}')
-        # The controller knows what to do when a real plant falls silent.
-        self.silent = True
-        complain(f'{silence}, waiting for the driver')
+        what = f'not ready within {patience:g} s: {", ".join(child.name for child in unready)}' \
+            if unready else f'no new sample for {patience:g} s'
+        if self.made:
+            what += f' after sample {self.first + self.made - 1}'
+        if p.driver and self.made:
+            # The controller knows what to do when a real plant falls silent.
+            self.silent = True
+            complain(self.titled(f'{what}, waiting for the driver'))
+            return
+        cure = ': does the driver listen to its command and publish its output? Where it needs ' \
+               'longer, start it yourself (--driver none)' if p.driver else ''
+        raise BrokenOffError('\n'.join([
+            self.titled(f'{what}{cure}, see {self.logs}'),
+            *(f'the end of {child.end_of_log()}' for child in unready)]))
 
 
 class RunPlan(NamedTuple):
@@ -157,8 +153,6 @@ def prepare(options: argparse.Namespace) -> RunPlan:
                 f'give each axis one of its own, like --set {name}/estimates.file=...')
         if options.out is not None and (options.out / name / BAG).exists():
             raise InputError(f'--out={options.out}: holds a bag already, choose another folder')
-    if options.unlimited and not any(p.driver for p in parameters.values()):
-        raise InputError('--unlimited is about a driver: give --driver as well')
     # The nodes need a path that holds wherever it is read.
     out = result_directory(options.out).resolve()
     axes = [Axis(name, p, out / name) for name, p in parameters.items()]
@@ -182,18 +176,14 @@ def _checked(p: Parameters, axis: str, options: argparse.Namespace) -> Parameter
         shlex.split(driver)
     except ValueError as error:
         raise ParameterError('driver', driver, 'is not a command', str(error)) from None
-    for wrong, name, value, rule, cure in (
-        (driver and p.lockstep, 'driver', driver, 'excludes lockstep',
-         'a real plant does not wait for its control'),
-        ('{axis}' in driver and not axis, 'driver', driver, 'names an axis',
-         'list the axes in the parameter axes'),
-        (p.joints and not driver, 'driver', driver, 'is empty, and nothing here simulates several '
-         'joints', 'give --driver COMMAND, or none for one that you start yourself; '
-         '`simulate --axis JOINT` simulates one of them'),
-        (p.bag, 'bag', p.bag, 'is made by bringup', 'choose its folder with --out'),
-    ):
-        if wrong:
-            raise ParameterError(name, value, rule, cure)
+    if driver and p.lockstep:
+        raise ParameterError('driver', driver, 'excludes lockstep',
+                             'a real plant does not wait for its control')
+    if p.joints and not driver:
+        raise ParameterError(
+            'driver', driver, 'is empty, and nothing here simulates several joints',
+            'give --driver COMMAND, or none for one that you start yourself; '
+            '`simulate --axis JOINT` simulates one of them')
     for joint in p.joint_names:
         own = p.of_joint(joint)
         if driver and not options.unlimited and (missing := own.missing_limits):

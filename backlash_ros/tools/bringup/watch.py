@@ -102,18 +102,17 @@ def run(plan: RunPlan) -> str:
 
     Raises BrokenOffError where nothing can start.
     """
-    discovery = os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    name = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
+    discovery = f'{name}={os.environ.get(name, "LOCALHOST")}'
     domain = None
     with StopRequests() as requests, ExitStack() as stack:
         if any(axis.parameters.driver == ELSEWHERE for axis in plan.axes):
             # Whoever started the driver did so in the domain that is set there, or in none.
             print('waiting for the driver as long as it takes: start it with ROS_DOMAIN_ID='
-                  f'{os.environ.get("ROS_DOMAIN_ID") or 0} '
-                  f'ROS_AUTOMATIC_DISCOVERY_RANGE={discovery}')
+                  f'{os.environ.get("ROS_DOMAIN_ID") or 0} {discovery}')
         elif not os.environ.get('ROS_DOMAIN_ID'):
             domain = stack.enter_context(free_domain())
-            print(f'to listen in: export ROS_DOMAIN_ID={domain} '
-                  f'ROS_AUTOMATIC_DISCOVERY_RANGE={discovery}')
+            print(f'to listen in: export ROS_DOMAIN_ID={domain} {discovery}')
         for axis in plan.axes:
             if not axis.parameters.autostart:
                 print(f'waiting until somebody activates {axis.process_name("controller")} '
@@ -148,10 +147,10 @@ def report(axis: Axis, record: bool) -> bool:
         except (InputError, OSError) as error:
             complain(axis.titled(f'no report: {error}'))
             good = False
-            continue
-        print(estimate_table(summary, joint or axis.name))
-        latency = summary['loop_latency_ms']
-        print(f'{summary["samples"]} samples, {summary["lost_samples"]} lost', *(
-            f'y to v within {latency[each]:.2f} ms ({each})' for each in latency or ()), sep=', ')
-        print(f'report: {out / REPORT_PAGE}')
+        else:
+            latency = summary['loop_latency_ms'] or {}
+            print(estimate_table(summary, joint or axis.name))
+            print(f'{summary["samples"]} samples, {summary["lost_samples"]} lost', *(
+                f'y to v within {ms:.2f} ms ({each})' for each, ms in latency.items()), sep=', ')
+            print(f'report: {out / REPORT_PAGE}')
     return good

@@ -74,7 +74,7 @@ def test_a_process_that_is_never_ready_is_named_with_the_end_of_its_log(
     monkeypatch.setattr(planning, 'START_DEADLINE_S', 5.0)
     lines = 'import time; print("hello", *range(100, 130), sep="\\n", flush=True)'
     run = watch(slow=f'{lines}; time.sleep(600)', quick=f'{READY}; {WAIT}')
-    assert run.failure.startswith('not ready within 5 s: slow\n')
+    assert run.failure.startswith('not ready within 5 s: slow, see ')
     assert '    129' in run.complaint
     assert '    119' not in run.complaint
     assert (tmp_path / 'logs' / 'slow.log').read_text().startswith('hello\n100\n')

@@ -32,16 +32,13 @@ DRIVER = 'drive --axis {axis}'
     (['--set', 'plant.denominator=[0, 0]'], ['plant.denominator']),
     (['--set', 'control.min=3', '--set', 'control.max=2'], ['control.min', 'control.max']),
     (['--set', 'waveform=file'], ['file', 'CSV']),
-    (['--set', 'bag=here'], ['bag', 'here', '--out']),
     (['--duration', '0.015'], ['duration', '0.015', 'sample_period']),
     (['--duration', '-1'], ['duration', '-1']), (['--duration', 'long'], ['--duration', 'long']),
     (['--driver', 'x', '--lockstep'], ["driver='x'", 'excludes lockstep', 'does not wait']),
-    (['--driver', 'x --axis {axis}'], ['driver', 'names an axis', 'axes']),
     (['--driver', 'x'], ['control.min=-inf', 'set control.min, control.max, control.rate_max',
                          'give --unlimited']),
     (['--driver', 'none', '--set', 'control.min=-5', '--set', 'control.max=5'], [
         'control.rate_max=inf', 'set control.rate_max, or']),
-    (['--unlimited'], ['give --driver as well']),
     (['--driver', "x 'y"], ['driver', 'is not a command', 'quotation']),
     (['--axis', 'x'], ["no axis 'x'", 'axes', '/bringup']),
     (['--set', 'x/seed=3'], ['x/seed', "no axis 'x'"]),
@@ -162,7 +159,6 @@ def begun(folder: Path, driver: str = '', **values: object) -> Axis:
 
 
 def let_pass(axis: Axis, seconds: float) -> None:
-    axis.began -= seconds
     axis.moved -= seconds
 
 
@@ -217,5 +213,5 @@ def test_a_driver_without_a_first_sample_is_an_error_unless_somebody_else_starts
         if driver == 'none':
             axis.check_pace()
         else:
-            with pytest.raises(BrokenOffError, match='does the driver publish its output'):
+            with pytest.raises(BrokenOffError, match='does the driver .* publish its output'):
                 axis.check_pace()
