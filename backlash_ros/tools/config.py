@@ -12,8 +12,18 @@ from typing import Any, NamedTuple
 import yaml
 
 from backlash_ros.atomic_file import write_atomically
-from backlash_ros.core import parameters as catalogue
-from backlash_ros.core.parameters import BRINGUP, BY_NAME, ParameterError, Parameters, Value
+from backlash_ros.core.parameters import (
+    BRINGUP,
+    BY_NAME,
+    CONTROLLER,
+    NODES,
+    ParameterError,
+    Parameters,
+    Value,
+    check_names,
+    check_value,
+    entry_of,
+)
 from backlash_ros.options import find_config
 from backlash_ros.tools.cli import InputError
 
@@ -75,8 +85,8 @@ class Configuration(NamedTuple):
 def _sections_for(axis: str) -> tuple[list[str], ...]:
     """Names of what concerns an axis, '' for a loop without one, the most specific ones last."""
     own = f'/{axis}' if axis else ''
-    return ([f'/{ANY}'], [f'{own}/{ANY}'], [f'/{ANY}/{node}' for node in catalogue.NODES],
-            [f'/{BRINGUP}', *(f'{own}/{node}' for node in catalogue.NODES)])
+    return ([f'/{ANY}'], [f'{own}/{ANY}'], [f'/{ANY}/{node}' for node in NODES],
+            [f'/{BRINGUP}', *(f'{own}/{node}' for node in NODES)])
 
 
 def read_configuration(
@@ -87,19 +97,22 @@ def read_configuration(
     sections = _read_sections(path)
     try:
         listed: dict[str, Any] = {
-            name: catalogue.check_value(BY_NAME[name], values[name])
+            name: check_value(BY_NAME[name], values[name])
             for values in sections.values() for name in ('axes', 'joints') if name in values}
         listed |= {name: value for _, name, value in parsed if name == 'axes'}
         axes, joints = listed.get('axes', ()), listed.get('joints', ())
         known = [name for axis in axes or ('',) for names in _sections_for(axis) for name in names]
-        for section in sections:
+        for section, values in sections.items():
             if section not in known:
                 where = f'the axes {", ".join(axes)}' if axes else \
                     f'a run without the parameter axes, under /{BRINGUP}'
                 near = difflib.get_close_matches(section, known, n=1, cutoff=0.0)[0]
                 raise InputError(
                     f'section {section!r} is for no node of {where}: did you mean {near}?')
-        checked = {name: _checked(name, values, joints) for name, values in sections.items()}
+            Parameters({'joints': joints, **values})  # checks all names and values
+        checked = {section: {
+            name: check_value(entry_of(name) or BY_NAME[name], value)
+            for name, value in values.items()} for section, values in sections.items()}
     except (ParameterError, InputError) as error:
         error.args = (f'{path}: {error}',)
         raise
@@ -122,12 +135,12 @@ def parse_setting(text: str) -> tuple[str, str, Value]:
     axis, slash, name = key.strip().rpartition('/')
     if not equals or (slash and not axis):
         raise InputError(f'--set {text!r} must be KEY=VALUE or AXIS/KEY=VALUE')
-    catalogue.check_names([name])
+    check_names([name])
     try:
         value = given if isinstance(BY_NAME[name].default, str) else yaml.safe_load(given)
     except yaml.YAMLError:
         raise ParameterError(name, given, 'is not a value in YAML') from None
-    return axis, name, catalogue.check_value(BY_NAME[name], value)
+    return axis, name, check_value(BY_NAME[name], value)
 
 
 def _no_such_axis(axis: str, axes: Sequence[str]) -> str:
@@ -175,22 +188,6 @@ def flattened(tree: Mapping[object, object], prefix: str = '') -> Iterator[tuple
             yield f'{prefix}{key}', value
 
 
-def _checked(
-    section: str, values: Mapping[str, object], joints: Sequence[str],
-) -> dict[str, Value]:
-    node = section.rpartition('/')[2]
-    Parameters({'joints': joints, **values})  # checks all names and values
-    checked = {}
-    for name, value in values.items():
-        entry = catalogue.entry_of(name)
-        assert entry is not None
-        checked[name] = catalogue.check_value(entry, value)
-        if node not in (ANY, *entry.used_by):
-            raise ParameterError(name, checked[name], f'is not a parameter of {node}',
-                                 f'put it under /{ANY} or /{entry.used_by[0]}')
-    return checked
-
-
 class _Dumper(yaml.SafeDumper):
     """Writes each list on one line."""
 
@@ -212,7 +209,7 @@ def config_text(parameters: Parameters) -> str:
     for joint in parameters.joints:
         of_joint = parameters.of_joint(joint)
         tree[joint] = _tree(of_joint, (
-            p.name for p in common if catalogue.CONTROLLER in p.used_by and not p.per_node
+            p.name for p in common if CONTROLLER in p.used_by and not p.per_node
             and of_joint[p.name] != parameters[p.name]))
     return yaml.dump({f'/{ANY}': {'ros__parameters': tree}}, Dumper=_Dumper, sort_keys=False,
                      width=1000)

@@ -213,5 +213,5 @@ def test_a_driver_without_a_first_sample_is_an_error_unless_somebody_else_starts
         if driver == 'none':
             axis.check_pace()
         else:
-            with pytest.raises(BrokenOffError, match='does the driver .* publish its output'):
+            with pytest.raises(BrokenOffError, match=r'does the driver .* publish its output'):
                 axis.check_pace()
