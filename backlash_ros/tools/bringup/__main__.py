@@ -41,10 +41,9 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
                         'every sample waiting for its control, instead of real time')
     parser.add_argument('--record', action=argparse.BooleanOptionalAction, default=True,
                         help='record a bag and write a report from it')
-    parser.add_argument('--live', action='store_true',
+    parser.add_argument('--live', action='store_const', const=0, dest='live_port',
                         help='show the loop on a page in the browser; its address is printed')
-    parser.add_argument('--live-port', type=port, metavar='PORT',
-                        help='the same on this port (default: a free one)')
+    parser.add_argument('--live-port', type=port, metavar='PORT', help='the same on this port')
     return parser.parse_args(arguments)
 
 
@@ -53,9 +52,9 @@ def _bringup(arguments: Sequence[str] | None) -> int:
     # numpy and scipy take a second to load, in which a Ctrl-C is to be heard already.
     from backlash_ros.tools.bringup.plan import prepare
     from backlash_ros.tools.bringup.watch import report, run
-    plan = prepare(options)
-    failure = run(plan)
-    reported = [axis.made > 0 and report(axis, plan.record) for axis in plan.axes]
+    axes = prepare(options)
+    failure = run(axes, options.record, options.live_port)
+    reported = [axis.made > 0 and report(axis, options.record) for axis in axes]
     return DONE if all(reported) and not failure else FAILED
 
 

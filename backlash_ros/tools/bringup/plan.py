@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from math import inf
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_controller, build_plant, build_reference
@@ -62,13 +62,16 @@ class Axis:
 
     @property
     def complete(self) -> bool:
-        """Whether all samples were made; a driver does not say so, the recorder hears it."""
-        p = self.parameters
-        return 0 < p.samples <= self.made if p.driver else self.published is not None
+        """Whether all samples were made, and those of a simulated plant heard.
 
-    @property
-    def unheard(self) -> dict[str, int]:
-        return Counter(self.published or {}) - Counter(self.heard)
+        A driver does not say how many there were. The middleware sends again what got lost on the
+        way to a recorder that was held up, with its own settings every 3 s.
+        """
+        p = self.parameters
+        if p.driver or self.published is None:
+            return bool(p.driver) and 0 < p.samples <= self.made
+        unheard = Counter(self.published) - Counter(self.heard)
+        return not unheard or time.monotonic() > self.moved + 10.0
 
     def take(self, progress: Mapping[str, Any]) -> None:
         sample, p, now = progress['sample'], self.parameters, time.monotonic()
@@ -113,24 +116,8 @@ class Axis:
             *(f'the end of {child.end_of_log()}' for child in unready)]))
 
 
-class RunPlan(NamedTuple):
-    """The controllers of a run. live_port: of the page in the browser, 0 for a free one."""
-
-    axes: Sequence[Axis]
-    record: bool = True
-    live_port: int | None = None
-
-    @property
-    def stop_times(self) -> tuple[float, float]:
-        """How long to wait after the end of a stage, and beyond the usual time for an end [s]."""
-        parameters = [axis.parameters for axis in self.axes]
-        # The last command of a controller acts from the next sample of its driver on.
-        settling = max(2.0 * p.sample_period * bool(p.driver) for p in parameters)
-        return min(settling, 1.0), max(p.timeout.ramp for p in parameters)
-
-
-def prepare(options: argparse.Namespace) -> RunPlan:
-    """Check all input, then make the result folders."""
+def prepare(options: argparse.Namespace) -> list[Axis]:
+    """The axes of a run: checks all input, then makes the folders of the results."""
     if ros_is_missing():
         raise BrokenOffError(ROS_MISSING)
     configuration = read_configuration(options.config, options.settings, options.seed)
@@ -162,8 +149,7 @@ def prepare(options: argparse.Namespace) -> RunPlan:
                                axis.parameters.of_joint(joint))
         axis.logs.mkdir(parents=True, exist_ok=True)
         write_config(axis.parameters, axis.out / CONFIG_FILE)
-    live = options.live or options.live_port is not None
-    return RunPlan(axes, options.record, options.live_port or 0 if live else None)
+    return axes
 
 
 def _checked(p: Parameters, axis: str, options: argparse.Namespace) -> Parameters:
@@ -198,32 +184,43 @@ def _checked(p: Parameters, axis: str, options: argparse.Namespace) -> Parameter
     return p
 
 
-def plan_processes(plan: RunPlan) -> list[list[Child]]:
+def stop_times(axes: Sequence[Axis]) -> tuple[float, float]:
+    """How long to wait after the end of a stage, and beyond the usual time for an end [s]."""
+    parameters = [axis.parameters for axis in axes]
+    # The last command of a controller acts from the next sample of its driver on.
+    settling = max(2.0 * p.sample_period * bool(p.driver) for p in parameters)
+    return min(settling, 1.0), max(p.timeout.ramp for p in parameters)
+
+
+def plan_processes(
+    axes: Sequence[Axis], record: bool = True, live_port: int | None = None,
+) -> list[list[Child]]:
     """The processes of a run by stages, which are to be stopped one after the other.
 
     A simulated plant stops first, so that no output stays without its answer. With a driver the
-    controller goes first and the driver hears its last command. The recorder goes last.
+    controller goes first and the driver hears its last command. The recorder goes last. live_port:
+    of the page in the browser, 0 for a free one.
     """
     stages: list[list[Child]] = [[], [], [], []]
     served: dict[str, list[Axis]] = {}
-    for axis in plan.axes:
+    for axis in axes:
         p = axis.parameters
         order = ('plant', 'reference', 'controller', 'recorder')
         if p.driver:
             order = ('controller', '', '' if p.joints else 'reference', 'recorder')
         for stage, node in zip(stages, order, strict=True):
             if node:
-                stage.append(_node(axis, node, *_arguments(axis, node, plan.record)))
+                stage.append(_node(axis, node, *_arguments(axis, node, record)))
         if p.driver and p.driver != ELSEWHERE:
             served.setdefault(p.driver, []).append(axis)
-    for command, axes in served.items():
-        name = axes[0].process_name('driver') if len(axes) == 1 else \
-            f'driver of {", ".join(axis.name for axis in axes)}'
+    for command, of in served.items():
+        name = of[0].process_name('driver') if len(of) == 1 else \
+            f'driver of {", ".join(axis.name for axis in of)}'
         stages[1].append(Child(
-            name, shlex.split(command), axes[0].logs / 'driver.log', foreign=True))
-    if plan.live_port is not None:
-        shown = [f'/{axis.name}' if axis.name else '/controller' for axis in plan.axes]
-        stages[-1].append(_node(plan.axes[0], 'live', '--port', str(plan.live_port), *shown))
+            name, shlex.split(command), of[0].logs / 'driver.log', foreign=True))
+    if live_port is not None:
+        shown = [f'/{axis.name}' if axis.name else '/controller' for axis in axes]
+        stages[-1].append(_node(axes[0], 'live', '--port', str(live_port), *shown))
     return stages
 
 
@@ -231,7 +228,7 @@ def _node(axis: Axis, node: str, *arguments: str) -> Child:
     of_all = node == 'live'  # the page of all axes
     return Child(node if of_all else axis.process_name(node),
                  (sys.executable, '-m', f'backlash_ros.nodes.{node}', *arguments),
-                 axis.logs / f'{node}.log', axis.name, spectator=of_all)
+                 axis.logs / f'{node}.log', axis, spectator=of_all)
 
 
 def _arguments(axis: Axis, node: str, record: bool) -> list[str]:

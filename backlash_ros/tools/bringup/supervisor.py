@@ -84,18 +84,19 @@ def free_domain() -> Iterator[int]:
 
 @dataclass(eq=False)
 class Child:
-    """A process; axis: that its events are about.
+    """A process; axis: what its events are about.
 
     foreign: no node of this package, which tells nothing but by its log. spectator: once it is
-    ready, the run goes on without it.
+    ready, which it says, the run goes on without it.
     """
 
     name: str
     command: Sequence[str]
     log: Path
-    axis: str = ''
+    axis: Any = None
     foreign: bool = False
     spectator: bool = False
+    ready: bool = False
     process: subprocess.Popen[bytes] = field(init=False)
 
     def start(self, environment: Mapping[str, str]) -> None:

@@ -4,10 +4,11 @@ import os
 import signal
 import sys
 import time
+from collections.abc import Sequence
 from contextlib import ExitStack
 
 from backlash_ros import topics
-from backlash_ros.tools.bringup.plan import ELSEWHERE, Axis, RunPlan, complain, plan_processes
+from backlash_ros.tools.bringup.plan import ELSEWHERE, Axis, complain, plan_processes, stop_times
 from backlash_ros.tools.bringup.supervisor import (
     ProcessSupervisor,
     child_environment,
@@ -17,87 +18,67 @@ from backlash_ros.tools.cli import BrokenOffError, InputError, StopRequests
 from backlash_ros.tools.runs.files import BAG
 
 
-class RunWatch:
-    """Watches the processes of a run. failure: what went wrong, empty as long as nothing did."""
-
-    def __init__(
-        self, plan: RunPlan, supervisor: ProcessSupervisor, requests: StopRequests,
-    ) -> None:
-        self._supervisor, self._requests = supervisor, requests
-        self._axes = {axis.name: axis for axis in plan.axes}
-        self._unready = {child for child in supervisor.children if not child.foreign}
-        self.failure = ''
-
-    def execute(self) -> None:
-        """Wait until all samples are made, then stop everything; sets failure."""
-        axes = self._axes.values()
-        try:
-            while not (self._over or all(axis.complete for axis in axes)):
-                self._listen()
-                for axis in axes:
-                    axis.check_pace([child for child in self._unready if child.axis == axis.name])
-            # The middleware sends again what got lost on the way to a recorder that was held up,
-            # with its own settings every 3 s.
-            deadline = time.monotonic() + 10.0
-            while not self._over and time.monotonic() < deadline and any(a.unheard for a in axes):
-                self._listen()
-            if self._over:
-                complain(f'{self._requests.last} ends the run')
-        except BrokenOffError as error:
-            # Said before the processes are stopped, which may take a while.
-            self._fail(str(error))
-        self._supervisor.stop()
-        self._take_events(0.0)
-        for child in self._supervisor.children if not self.failure else ():
-            code = child.process.returncode
-            # How a program of the user says good-bye is its own affair.
-            if code and (not child.foreign or code == -signal.SIGKILL):
-                self._fail(child.describe_end('did not stop cleanly'))
-
-    def _fail(self, failure: str) -> None:
-        self.failure = failure
-        complain(failure)
-
-    @property
-    def _over(self) -> bool:
-        """Whether the user ends a run that has no other end."""
-        axes = self._axes.values()
-        return self._requests.count > 0 and all(axis.made > 0 for axis in axes) \
-            and any(axis.parameters.samples == 0 for axis in axes)
-
-    def _listen(self) -> None:
-        self._take_events(0.1)
-        if self._requests.count and not self._over:
-            raise BrokenOffError(f'interrupted by {self._requests.last}, stopping')
-        dead = []
-        for child in [*self._supervisor.children]:
-            if child.process.poll() is not None:
-                if child.spectator and child not in self._unready:
-                    self._supervisor.children.remove(child)
-                    complain(child.describe_end('died', ', the run goes on without it'))
-                else:
-                    dead.append(child.describe_end('died'))
-        if dead:
-            raise BrokenOffError('\n'.join(dead))
-
-    def _take_events(self, timeout_s: float) -> None:
-        for child, content in self._supervisor.events(timeout_s):
-            axis, kind = self._axes[child.axis], content['event']
-            if kind == 'ready':
-                self._unready.discard(child)
-                axis.moved = time.monotonic()
-                if 'address' in content:
-                    print(f'{child.name}: {content["address"]}', flush=True)
-            elif kind == 'done':
-                axis.published = content['published']
-            elif kind == 'progress':
-                axis.take(content)
-            elif kind == 'complaint':
-                # The log may lie on the very disk that is full.
-                complain(axis.titled(content['text']))
+def execute(
+    axes: Sequence[Axis], supervisor: ProcessSupervisor, requests: StopRequests,
+) -> str:
+    """Wait until all samples are made, then stop everything; what went wrong, '' if nothing did."""
+    failure = ''
+    try:
+        while not (requests.count or all(axis.complete for axis in axes)):
+            take_events(supervisor, 0.1)
+            check_processes(supervisor)
+            for axis in axes:
+                axis.check_pace([child for child in supervisor.children
+                                 if child.axis is axis and not (child.foreign or child.ready)])
+        # It is the regular end of a run that has no other one.
+        endless = any(axis.parameters.samples == 0 for axis in axes)
+        if requests.count and not (endless and all(axis.made for axis in axes)):
+            raise BrokenOffError(f'interrupted by {requests.last}, stopping')
+        if requests.count:
+            complain(f'{requests.last} ends the run')
+    except BrokenOffError as error:
+        failure = str(error)
+        complain(failure)  # before the processes are stopped, which may take a while
+    supervisor.stop()
+    take_events(supervisor, 0.0)
+    for child in supervisor.children if not failure else ():
+        code = child.process.returncode
+        # How a program of the user says good-bye is its own affair.
+        if code and (not child.foreign or code == -signal.SIGKILL):
+            failure = child.describe_end('did not stop cleanly')
+            complain(failure)
+    return failure
 
 
-def run(plan: RunPlan) -> str:
+def take_events(supervisor: ProcessSupervisor, timeout_s: float) -> None:
+    for child, content in supervisor.events(timeout_s):
+        axis, kind = child.axis, content['event']
+        if kind in ('ready', 'done'):
+            axis.moved = time.monotonic()
+        if kind == 'ready':
+            child.ready = True
+            if 'address' in content:
+                print(f'{child.name}: {content["address"]}', flush=True)
+        elif kind == 'done':
+            axis.published = content['published']
+        elif kind == 'progress':
+            axis.take(content)
+        elif kind == 'complaint':
+            # The log may lie on the very disk that is full.
+            complain(axis.titled(content['text']))
+
+
+def check_processes(supervisor: ProcessSupervisor) -> None:
+    """Raise BrokenOffError if one without which the run does not go on has died."""
+    gone = [child for child in supervisor.children if child.process.poll() is not None]
+    if dead := [child for child in gone if not (child.spectator and child.ready)]:
+        raise BrokenOffError('\n'.join(child.describe_end('died') for child in dead))
+    for child in gone:
+        supervisor.children.remove(child)
+        complain(child.describe_end('died', ', the run goes on without it'))
+
+
+def run(axes: Sequence[Axis], record: bool, live_port: int | None) -> str:
     """Run all processes to the end; what went wrong, '' where nothing did.
 
     Raises BrokenOffError where nothing can start.
@@ -106,14 +87,14 @@ def run(plan: RunPlan) -> str:
     discovery = f'{name}={os.environ.get(name, "LOCALHOST")}'
     domain = None
     with StopRequests() as requests, ExitStack() as stack:
-        if any(axis.parameters.driver == ELSEWHERE for axis in plan.axes):
+        if any(axis.parameters.driver == ELSEWHERE for axis in axes):
             # Whoever started the driver did so in the domain that is set there, or in none.
             print('waiting for the driver as long as it takes: start it with ROS_DOMAIN_ID='
                   f'{os.environ.get("ROS_DOMAIN_ID") or 0} {discovery}')
         elif not os.environ.get('ROS_DOMAIN_ID'):
             domain = stack.enter_context(free_domain())
             print(f'to listen in: export ROS_DOMAIN_ID={domain} {discovery}')
-        for axis in plan.axes:
+        for axis in axes:
             if not axis.parameters.autostart:
                 print(f'waiting until somebody activates {axis.process_name("controller")} '
                       '(autostart: false)')
@@ -122,11 +103,9 @@ def run(plan: RunPlan) -> str:
                       f'{axis.process_name(topics.ROBOT_COMMAND)}')
         sys.stdout.flush()
         supervisor = stack.enter_context(ProcessSupervisor(
-            plan_processes(plan), child_environment(plan.axes[0].logs, domain),
-            lambda: requests.count > 1, *plan.stop_times))
-        watch = RunWatch(plan, supervisor, requests)
-        watch.execute()
-    return watch.failure
+            plan_processes(axes, record, live_port), child_environment(axes[0].logs, domain),
+            lambda: requests.count > 1, *stop_times(axes)))
+        return execute(axes, supervisor, requests)
 
 
 def report(axis: Axis, record: bool) -> bool:

@@ -13,9 +13,9 @@ from bringup_processes import DEADLINE_S, MARK, marked_processes, wait_until
 
 from backlash_ros.tools.bringup import plan as planning
 from backlash_ros.tools.bringup import supervisor as supervising
-from backlash_ros.tools.bringup.plan import Axis, RunPlan
+from backlash_ros.tools.bringup.plan import Axis
 from backlash_ros.tools.bringup.supervisor import Child, ProcessSupervisor, child_environment
-from backlash_ros.tools.bringup.watch import RunWatch
+from backlash_ros.tools.bringup.watch import execute
 from backlash_ros.tools.cli import StopRequests
 from backlash_ros.tools.config import effective_parameters
 
@@ -56,13 +56,12 @@ def watch(
         axis = Axis('', parameters, tmp_path)
         axis.logs.mkdir()
         stages = [
-            [Child(name, (sys.executable, '-c', program), axis.logs / f'{name}.log',
-                   foreign=name == 'driver')] for name, program in programs.items()]
+            [Child(name, (sys.executable, '-c', program), axis.logs / f'{name}.log', axis)]
+            for name, program in programs.items()]
         environment = child_environment(axis.logs, None)
         with ProcessSupervisor(stages, environment, lambda: hurry) as supervisor:
-            run = RunWatch(RunPlan([axis]), supervisor, StopRequests())
-            run.execute()
-        return Watched(run.failure, capsys.readouterr().err, mark)
+            failure = execute([axis], supervisor, StopRequests())
+        return Watched(failure, capsys.readouterr().err, mark)
     yield watch_programs
     for pid in marked_processes(mark):
         os.kill(pid, signal.SIGKILL)

@@ -13,9 +13,9 @@ from backlash_ros.tools.bringup import __main__ as bringup
 from backlash_ros.tools.bringup.plan import (
     START_DEADLINE_S,
     Axis,
-    RunPlan,
     plan_processes,
     prepare,
+    stop_times,
 )
 from backlash_ros.tools.bringup.supervisor import Child, child_environment, foreign_environment
 from backlash_ros.tools.cli import BrokenOffError
@@ -86,9 +86,9 @@ def test_what_the_user_has_set_reaches_the_nodes(tmp_path, monkeypatch):
     assert environment['ROS_DOMAIN_ID'] == '9'
 
 
-def plan(folder: Path, driver: str, *names: str, **values: object) -> RunPlan:
+def plan(folder: Path, driver: str, *names: str, **values: object) -> list[Axis]:
     parameters = effective_parameters(None).replaced({'driver': driver, **values})
-    return RunPlan([Axis(name, parameters, folder / name) for name in names or ('',)])
+    return [Axis(name, parameters, folder / name) for name in names or ('',)]
 
 
 def names_of(stages: list[list[Child]]) -> list[list[str]]:
@@ -101,8 +101,8 @@ def test_plant_stops_first_but_a_driver_only_after_the_controller(tmp_path: Path
     stages = plan_processes(plan(tmp_path, 'run it'))
     assert names_of(stages) == [['controller'], ['driver'], ['reference'], ['recorder']]
     assert stages[1][0].command == ['run', 'it']
-    assert plan(tmp_path, 'run it', sample_period=0.05).stop_times == (0.1, 0.5)
-    assert plan(tmp_path, '', **{'timeout.ramp': 20.0}).stop_times == (0.0, 20.0)
+    assert stop_times(plan(tmp_path, 'run it', sample_period=0.05)) == (0.1, 0.5)
+    assert stop_times(plan(tmp_path, '', **{'timeout.ramp': 20.0})) == (0.0, 20.0)
     assert names_of(plan_processes(plan(tmp_path, 'none'))) == [
         ['controller'], [], ['reference'], ['recorder']]
 
@@ -125,7 +125,7 @@ def test_foreign_program_gets_no_variables_that_were_made_for_this_python() -> N
     assert foreign_environment(made)['LD_LIBRARY_PATH'] == made['LD_LIBRARY_PATH']
 
 
-def planned(folder: Path, *arguments: str) -> RunPlan:
+def planned(folder: Path, *arguments: str) -> list[Axis]:
     return prepare(bringup.parse_options(
         ['--config', str(CONFIG), '--out', str(folder), *arguments]))
 
@@ -142,12 +142,11 @@ def test_each_axis_gets_a_driver_in_whose_command_it_is_named(tmp_path: Path) ->
 
 
 def test_one_axis_alone_can_be_taken_from_the_file(tmp_path: Path) -> None:
-    plan = planned(tmp_path, '--axis', 'tilt', '--lockstep')
-    (axis,) = plan.axes
+    (axis,) = planned(tmp_path, '--axis', 'tilt', '--lockstep')
     assert (axis.name, [path.name for path in tmp_path.iterdir()]) == ('tilt', ['tilt'])
     values = [axis.parameters[f'backlash.{name}'] for name in ('m', 'c_r', 'c_l')]
     assert (*values, axis.parameters.frequency) == (0.8, 1.0, -2.0, 9.0)
-    processes = [process for stage in plan_processes(plan) for process in stage]
+    processes = [process for stage in plan_processes([axis]) for process in stage]
     assert [process.name for process in processes] == [
         'tilt/plant', 'tilt/reference', 'tilt/controller', 'tilt/recorder']
     assert all('__ns:=/tilt' in process.command for process in processes)
@@ -170,15 +169,19 @@ def test_samples_of_a_driver_that_ran_before_count_from_the_first_one_heard(tmp_
     assert axis.complete
 
 
-def test_a_plant_is_complete_once_it_says_so_and_what_is_unheard_is_counted(tmp_path):
+def test_a_plant_is_complete_once_all_that_it_says_was_heard_or_waited_for(tmp_path):
     axis = begun(tmp_path)
     axis.take({'sample': 41, 'received': {'plant_output': 42}})
     assert not axis.complete
     axis.published = {'samples': 100, 'plant_output': 42}
+    let_pass(axis, 9.0)
+    assert not axis.complete
+    let_pass(axis, 2.0)
     assert axis.complete
-    assert axis.unheard == {'samples': 58}
+    axis.take({'sample': 99, 'received': {'plant_output': 41}})
+    assert not axis.complete
     axis.take({'sample': 99, 'received': {'plant_output': 42}})
-    assert axis.unheard == {}
+    assert axis.complete
 
 
 def test_a_plant_that_stands_still_is_an_error_that_names_the_last_sample(tmp_path: Path) -> None:
