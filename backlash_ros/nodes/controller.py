@@ -32,7 +32,7 @@ from backlash_ros.nodes.control.rivals import RivalWatch
 from backlash_ros.nodes.control.services import offer_services, refuse_unfit_transitions
 from backlash_ros.nodes.runtime.driver_io import DriverIo, check_style
 from backlash_ros.nodes.runtime.messages import DEPTH, DIAGNOSTICS_PERIOD_S, KEPT_QOS, line_of
-from backlash_ros.nodes.runtime.process import ProcessNode, emit, run
+from backlash_ros.nodes.runtime.process import ProcessNode, run
 
 
 class ControllerNode(LifecycleNodeMixin, ProcessNode):
@@ -162,7 +162,7 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
                 loop.heard.y_at = nan
         else:
             to = self._io.topics
-            self.call_when(self._are_all_there, self._listen,
+            self.start_when(self._are_all_there, self._listen,
                            f'{to.reference} and the listeners of {to.control}')
         return TransitionCallbackReturn.SUCCESS
 
@@ -185,7 +185,6 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
             self._steps.look()
             kept = sample_counter.kept_outputs(self.settings.sample_period)
             self._io.listen(self._on_output, min(kept, DEPTH))
-            emit('ready')
 
     def on_deactivate(self, state: LifecycleState | None) -> TransitionCallbackReturn:
         if self.active:

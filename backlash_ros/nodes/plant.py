@@ -54,7 +54,7 @@ class PlantNode(ProcessNode):
         name, start = self.resolve_topic_name, self._offer if p.lockstep else lambda: None
         self.log.info(f'started: {name(topics.CONTROL)} in, {name(topics.PLANT_OUTPUT)} out, '
                       f'sample_period {p.sample_period:g} s')
-        self.call_when(self._is_heard, start, f'subscribers of {topics.PLANT_OUTPUT}', starts=True)
+        self.start_when(self._is_heard, start, f'subscribers of {topics.PLANT_OUTPUT}')
 
     def _is_heard(self) -> bool:
         """Whether enough listen; one of several is a recorder, which wants everything."""

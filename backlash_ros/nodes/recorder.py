@@ -85,12 +85,12 @@ class RecorderNode(ProcessNode):
         # Lockstep promises every row: that of the first truth leaves as soon as y is subscribed to.
         truth = (topics.TRUTH,) if p.lockstep else ()
         wanted = (topics.ESTIMATES, topics.SIGNALS, *truth, to.reference, to.control)
-        self.call_when(
+        self.start_when(
             lambda: not p.wait_for_publishers or all(
                 self._channels[topic].subscription.get_publisher_count() for topic in wanted
             ),
             lambda: self._record(to.output, to.types[to.output], output_qos(p, RECORDER_DEPTH)),
-            ', '.join(wanted), starts=True,
+            ', '.join(wanted),
         )
 
     def work(self, executor: PromptExecutor) -> None:

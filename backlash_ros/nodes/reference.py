@@ -45,11 +45,11 @@ class ReferenceNode(ProcessNode):
         name = self.resolve_topic_name
         self.log.info(f'started: {name(self._io.topics.output)} in, {name(topics.REFERENCE)} out: '
                       f'{p.waveform}, sample_period {p.sample_period:g} s')
-        self.call_when(
+        self.start_when(
             lambda: self._output.get_subscription_count() >= p.wait_for_subscribers,
             lambda: p.lockstep and self.create_subscription(
                 Clock, topics.CLOCK, self._on_clock, messages.KEPT_QOS
-            ), f'{p.wait_for_subscribers} subscribers of {topics.REFERENCE}', starts=True,
+            ), f'{p.wait_for_subscribers} subscribers of {topics.REFERENCE}',
         )
 
     def work(self, executor: PromptExecutor) -> None:

@@ -71,10 +71,10 @@ class Rivals:
 
     def __init__(self, own: str, settled_at: float) -> None:
         self.own, self.settled_at = own, settled_at
-        self.since_ns, self._active_at = 0, inf
-        self._first_seen: dict[str, float] = {}
-        # What controllers say: active since [ns], 0 if they are not, and when they have said so.
-        self._claims: dict[str, tuple[int, float]] = {}
+        self.since_ns, self._active_at = 0, 0.0
+        # By identity: since when it is active [ns], 0 if it is not, and when it has said so; None,
+        # and when it was found, of whoever says nothing.
+        self._known: dict[str, tuple[int | None, float]] = {}
 
     def begin(self, since_ns: int, now: float) -> None:
         self.since_ns, self._active_at = since_ns, now
@@ -82,19 +82,17 @@ class Rivals:
     def hear(self, values: Mapping[str, str], now: float) -> None:
         identity, since = values.get(ENDPOINT, ''), values.get(SINCE, '')
         if identity and since.isdecimal():
-            self._claims[identity] = int(since), now
+            self._known[identity] = int(since), now
 
     def among(self, others: Mapping[str, str], now: float) -> tuple[Rival, ...]:
         """The rivals among the other publishers, given by identity with their names."""
-        self._first_seen = {each: self._first_seen.get(each, now) for each in others}
-        self._claims = {each: c for each, c in self._claims.items() if each in others}
+        self._known = {each: self._known.get(each, (None, now)) for each in others}
         found = []
         for each, name in others.items() if self.since_ns else ():
-            since_ns, heard_at = self._claims.get(each, (0, inf))
-            if heard_at == inf:
-                was_first = self._first_seen[each] <= max(self._active_at, self.settled_at)
-                found.append(Rival(name, was_first))
-            elif since_ns > 0 and now < heard_at + SILENT_S:
+            since_ns, at = self._known[each]
+            if since_ns is None:
+                found.append(Rival(name, at <= max(self._active_at, self.settled_at)))
+            elif since_ns > 0 and now < at + SILENT_S:
                 found.append(Rival(name, (since_ns, each) < (self.since_ns, self.own)))
         return tuple(sorted(found))
 

@@ -205,10 +205,9 @@ class DriverIo:
         found = dict(zip(message.name, values, strict=False))
         return {joint: found[joint or own] for joint in names if (joint or own) in found}
 
-    def advertise(self) -> Publisher:
+    def advertise(self) -> None:
         topic = self.topics.control
         self.publisher = self._node.create_publisher(self.topics.types[topic], topic, DEPTH)
-        return self.publisher
 
     def publish(self, commands: Mapping[str, float]) -> None:
         """Send v, by joint, to the driver; an array as soon as there is a v of every joint."""

@@ -3,34 +3,49 @@
 import argparse
 import contextlib
 import ctypes
+import difflib
 import gc
 import json
 import os
+import re
 import signal
 import struct
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
 from math import isfinite
+from pathlib import Path
 from typing import Any
 
 import rclpy
+from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.exceptions import NameValidationException
 from rclpy.executors import ExternalShutdownException
 from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.node import Node
+from rclpy.parameter import Parameter as RosParameter
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from rclpy.utilities import remove_ros_args
 
-from backlash_ros.core.parameters import BY_NAME, UNTOLD, ParameterError, as_yaml
+from backlash_ros.core.parameters import (
+    BY_NAME,
+    CONTROLLER,
+    UNTOLD,
+    ParameterError,
+    Parameters,
+    Value,
+    as_yaml,
+    check_value,
+    entry_of,
+)
 from backlash_ros.middleware import prefer_loopback
 from backlash_ros.nodes.runtime.executor import Polled, PromptExecutor
-from backlash_ros.nodes.runtime.parameters import ParameterNode, complaints
 from backlash_ros.options import BAD_INPUT, DONE, FAILED, OptionParser
 
 ENABLED = os.environ.get('BACKLASH_ROS_EVENTS') == '1'
@@ -56,12 +71,17 @@ def split_arguments(args: list[str] | None) -> tuple[list[str], list[str]]:
     return remove_ros_args(['', *arguments])[1:], of_ros
 
 
-class ProcessNode(ParameterNode):
+class ProcessNode(Node):
     """A node that is the purpose of its process: parameters checked, then work until stopped.
 
-    parameters_of: the executable whose parameters it reads. begun_at: from here on the node finds
-    others and is found, on the steady clock [s]. signals: the SIGINT and SIGTERM that have come.
+    Its `settings` are complete and checked; all or none of them change. parameters_of: the
+    executable whose parameters it reads. begun_at: from here on the node finds others and is found,
+    on the steady clock [s]. signals: the SIGINT and SIGTERM that have come.
     """
+
+    settings: Parameters
+    reconfigurable = False  # whether all but the fixed ones may change while it is unconfigured
+    configured = False  # whether only live ones may change now, of those that are not read-only
 
     def __init__(self, executable: str, parameters_of: str = '') -> None:
         super().__init__(executable)
@@ -70,6 +90,12 @@ class ProcessNode(ParameterNode):
         self.declare_settings(parameters_of or executable)
         self.signals: list[int] = []
         self.exit_code, self.started = DONE, False
+
+    def check_change(self, p: Parameters) -> None:
+        """Raise ParameterError for values that the node cannot take up."""
+
+    def take_up(self, before: Parameters) -> None:
+        """Use the settings, which have changed."""
 
     @property
     def stopping(self) -> bool:
@@ -99,11 +125,10 @@ class ProcessNode(ParameterNode):
     def finish(self) -> None:
         """Say what there is to say at the end; called once, whatever ended the work."""
 
-    def call_when(
+    def start_when(
         self, condition: Callable[[], bool], action: Callable[[], object], awaited: str,
-        starts: bool = False,
     ) -> None:
-        """Call action when condition holds; awaited: for the log; starts: the node is ready."""
+        """Call action when condition holds: the node is ready then. awaited: for the log."""
         remind = time.monotonic() + 5.0
 
         def look() -> None:
@@ -111,14 +136,81 @@ class ProcessNode(ParameterNode):
             if condition():
                 self.destroy_timer(timer)
                 action()
-                if starts:
-                    self.started = True
-                    emit('ready')
+                self.started = True
+                emit('ready')
             elif time.monotonic() > remind:
                 remind += 5.0
                 self.log.info(f'waiting for {awaited}')
 
         timer = self.every(0.01, look)
+
+    def declare_settings(self, executable: str) -> None:
+        """Declare what the table says of this executable; raises ParameterError."""
+        # rclpy has no other way to ask for all names that were given; two are declared by itself.
+        given = {
+            name: _given_value(parameter)
+            for name, parameter in self.handle.get_parameters(RosParameter).items()
+            if name not in ('use_sim_time', 'start_type_description_service')
+        }
+        self.settings = parameters = Parameters(given)
+        values = {p.name: parameters[p.name] for p in BY_NAME.values() if executable in p.used_by}
+        if executable == CONTROLLER:
+            # Of a joint's own parameters those that were given: all of them would be hundreds.
+            values |= {
+                name: parameters.of_joint(joint)[own] for name in given
+                for joint, _, own in [name.partition('.')] if joint in parameters.joint_names
+            }
+        # With a value missing rclpy would tell none of those that it is asked for; that of an empty
+        # list has a type only here.
+        for name in values:
+            self.declare_parameter(
+                name, descriptor=ParameterDescriptor(dynamic_typing=True), ignore_override=True
+            )
+        present = [_ros_parameter(name, value) for name, value in values.items()]
+        super().set_parameters_atomically(present)
+        for parameter in present:
+            entry = entry_of(parameter.name)
+            assert entry is not None
+            self.set_descriptor(parameter.name, ParameterDescriptor(
+                name=parameter.name, type=_ros_parameter(entry.name, entry.default).type_.value,
+                description=entry.description + (f' [{entry.unit}]' if entry.unit else ''),
+                additional_constraints='one of ' + ', '.join(entry.choices) if entry.choices
+                else entry.rules,
+                read_only=entry.change not in ('live', *['unconfigured'] * self.reconfigurable),
+            ))
+
+    def set_parameters_atomically(self, parameter_list: list[RosParameter]) -> SetParametersResult:
+        """Set what differs from the present values, in the declared types.
+
+        Command-line tools send 1e-6 as a text, and load whole files of mostly present values.
+        """
+        changes, values = [], {}
+        try:
+            for change in parameter_list:
+                name, entry = change.name, entry_of(change.name)
+                present = self.get_parameter_or(name).value
+                if entry is None or present is None:
+                    changes += [change] * (present is None or change.value != present)
+                elif (value := check_value(entry, _given_value(change))) \
+                        != check_value(entry, present):
+                    if entry.change == 'unconfigured' and self.configured:
+                        raise ParameterError(
+                            name, UNTOLD, 'is read-only while the node is configured',
+                            'deactivate it and clean it up first',
+                        )
+                    changes.append(_ros_parameter(name, value))
+                    values[name] = value
+            if not changes:
+                return SetParametersResult(successful=True)
+            settings = self.settings.replaced(values)
+            self.check_change(settings)
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        result = super().set_parameters_atomically(changes)
+        if result.successful:
+            before, self.settings = self.settings, settings
+            self.take_up(before)
+        return result
 
 
 def run(
@@ -216,3 +308,51 @@ def _initialise(arguments: list[str]) -> None:
         raise ParameterError('ROS', UNTOLD, f'cannot begin: {reason}') from None
     finally:
         set_logger_level('rcl', LoggingSeverity.UNSET)
+
+
+def _given_value(parameter: RosParameter) -> object:
+    if parameter.value is not None:
+        return parameter.value
+    entry = entry_of(parameter.name)
+    if entry is not None and (entry.names or entry.default == ()):
+        return ()
+    raise ParameterError(parameter.name, UNTOLD, 'has no value', 'give it one or leave it out')
+
+
+def _ros_parameter(name: str, value: Value) -> RosParameter:
+    kind, entry = RosParameter.Type, entry_of(name)
+    if value == () and entry:
+        return RosParameter(name, kind.STRING_ARRAY if entry.names else kind.DOUBLE_ARRAY, [])
+    return RosParameter(name, value=list(value) if isinstance(value, tuple) else value)
+
+
+def complaints(arguments: Sequence[str], executable: str, full_name: str) -> Iterator[str]:
+    """What to do for each section of given files that ROS 2 passes over without a word."""
+    for option, file in pairwise(arguments):
+        if option == '--params-file':
+            import yaml  # most nodes start without a file
+
+            # ROS 2 itself has refused what cannot be read.
+            content = yaml.safe_load(Path(file).read_text(encoding='utf-8'))
+            for name in unused(list(map(str, content or ())), executable, full_name):
+                yield f'{file}: section {name} is not for {full_name}, its values are not used: ' \
+                    f'write /**/{full_name.rpartition("/")[2]}'
+
+
+def unused(sections: Sequence[str], executable: str, full_name: str) -> list[str]:
+    """Sections that do not reach the node though they seem to be meant for it.
+
+    None where another one of its name does. A section with a namespace may be another axis.
+    """
+    *namespace, own = full_name.strip('/').split('/')
+    meant = []
+    for section in sections:
+        *above, last = section.strip('/').split('/')
+        if last == own or difflib.get_close_matches(last, [executable], cutoff=0.8):
+            # ** stands for any namespaces.
+            pattern = re.escape(f'/{section.strip("/")}').replace(r'/\*\*', '(/[^/]+)*')
+            if re.fullmatch(pattern.replace(r'/\*', '/[^/]+'), full_name):
+                return []
+            if not (namespace and above):
+                meant.append(section)
+    return meant

@@ -15,7 +15,7 @@ from backlash_ros.middleware import PROFILE, prefer_loopback
 from backlash_ros.nodes.control.publishing import watched_values
 from backlash_ros.nodes.control.rivals import ENDPOINT, SINCE, Rival, Rivals
 from backlash_ros.nodes.runtime import messages
-from backlash_ros.nodes.runtime.parameters import unused
+from backlash_ros.nodes.runtime.process import unused
 
 HERE = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
 
