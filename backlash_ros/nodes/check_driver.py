@@ -27,10 +27,10 @@ from backlash_ros.core.assembly import build_controller, build_limits
 from backlash_ros.core.control.limits import plausible
 from backlash_ros.core.identification.motion import Drive, drive_limits, strokes, waves
 from backlash_ros.core.parameters.table import CONTROLLER
-from backlash_ros.nodes.control.rivals import CommandLock, name_of
+from backlash_ros.nodes.control.rivals import CommandLock
 from backlash_ros.nodes.driver_graph import DriverGraph
 from backlash_ros.nodes.runtime.executor import PromptExecutor
-from backlash_ros.nodes.runtime.messages import DEPTH
+from backlash_ros.nodes.runtime.messages import DEPTH, name_of
 from backlash_ros.nodes.runtime.process import ProcessNode, run, split_arguments
 from backlash_ros.options import (
     BAD_INPUT,

@@ -26,11 +26,11 @@ from backlash_ros.core.loop.diagnosis import Neighbours
 from backlash_ros.core.loop.joint_loops import JointLoops
 from backlash_ros.core.loop.sample_counter import Output, SampleCounter, Timing
 from backlash_ros.core.parameters import CONTROLLER, ParameterError, Parameters
-from backlash_ros.nodes.control.joint import Joint, neighbours_of
+from backlash_ros.nodes.control.joint import Joint, offer_services
 from backlash_ros.nodes.control.publishing import StepPublisher
 from backlash_ros.nodes.control.rivals import RivalWatch
-from backlash_ros.nodes.control.services import offer_services, refuse_unfit_transitions
 from backlash_ros.nodes.runtime.driver_io import DriverIo, check_style
+from backlash_ros.nodes.runtime.executor import refuse_unfit_transitions
 from backlash_ros.nodes.runtime.messages import DEPTH, DIAGNOSTICS_PERIOD_S, KEPT_QOS, line_of
 from backlash_ros.nodes.runtime.process import ProcessNode, run
 
@@ -344,7 +344,7 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
         if not joints or joints[0] is self.joints[0]:
             rivals = tuple(rival.name for rival in self._rivals.found)
             self._around = (
-                neighbours_of(self, self._io, self.settings, rivals),
+                self._io.neighbours(rivals),
                 self._io.known_of(self.loops.counter.sender.timing()),
             )
         for joint in joints or self.joints:

@@ -1,14 +1,15 @@
-"""One joint of the controller: its loop, what /diagnostics says of it, and what is kept."""
+"""Joints of the controller: what /diagnostics says of their loops, and what can be asked."""
 
 import time
-from collections.abc import Callable, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Mapping, Sequence
+from concurrent import futures
 from math import isnan
 from pathlib import Path
+from typing import Any, cast
 
-from rclpy.node import Node
-from rclpy.qos import QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
-from rclpy.topic_endpoint_info import TopicEndpointInfo
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.task import Future
+from std_srvs.srv import SetBool, Trigger
 
 from backlash_ros.core.assembly import build_controller, first_guess
 from backlash_ros.core.estimates_file import save_estimate, worth_saving
@@ -19,9 +20,8 @@ from backlash_ros.core.loop.sample_counter import Timing
 from backlash_ros.core.parameters import NOISE, ParameterError, Parameters
 from backlash_ros.core.simulation.run_record import stated_deviations
 from backlash_ros.nodes.control.publishing import ModelPublisher
-from backlash_ros.nodes.control.rivals import name_of
-from backlash_ros.nodes.runtime.driver_io import DriverIo, output_qos
-from backlash_ros.nodes.runtime.messages import DEPTH, DiagnosticsPublisher, line_of, name_of_type
+from backlash_ros.nodes.runtime.driver_io import DriverIo
+from backlash_ros.nodes.runtime.messages import DiagnosticsPublisher, line_of
 from backlash_ros.nodes.runtime.process import ProcessNode
 
 
@@ -44,7 +44,7 @@ class Joint:
             node, p.io.joint or io.publisher.topic_name, part=name
         )
         # A disk that is slow to confirm a file would cost samples; one writing follows the other.
-        self._writer = ThreadPoolExecutor(1, thread_name_prefix='estimates')
+        self._writer = futures.ThreadPoolExecutor(1, thread_name_prefix='estimates')
         self.saved_at = time.monotonic()
 
     @property
@@ -61,7 +61,7 @@ class Joint:
                 'clean the node up, set it, and configure again',
             )
 
-    def save(self) -> Future[str] | None:
+    def save(self) -> futures.Future[str] | None:
         """Begin to save the estimates, if worth it; the result says why it failed, if it did."""
         p, estimate = self.p, self.loop.estimate
         if not p.estimates.file or not worth_saving(estimate):
@@ -164,35 +164,55 @@ def values_of(loop: ControlLoop, timing: Timing) -> dict[str, object]:
     }
 
 
-def neighbours_of(
-    node: Node, io: DriverIo, p: Parameters, rivals: tuple[str, ...],
-) -> diagnosis.Neighbours:
-    """Who is on the topics of the controller. rivals: who else publishes v."""
-    to, own, publishers = io.topics, node.get_fully_qualified_name(), \
-        node.get_publishers_info_by_topic
+def offer_services(node: ProcessNode, joints: Sequence[Joint]) -> None:
+    """Create ~/freeze_adaptation, ~/enable_compensation, ~/reset_estimates, ~/save_estimates."""
+    unconfigured = 'the controller is unconfigured: configure it first'
 
-    def peers_on(
-        topic: str, infos: list[TopicEndpointInfo],
-        offered_and_wanted: Callable[[QoSProfile], tuple[QoSProfile, QoSProfile]],
-    ) -> diagnosis.TopicFigures:
-        peers, kind = [], to.types[topic]
-        for info in infos:
-            (offers, wants), unfit = offered_and_wanted(info.qos_profile), ''
-            if info.topic_type != name_of_type(kind):
-                unfit = 'type'
-            elif qos_check_compatible(offers, wants)[0] == QoSCompatibility.ERROR:
-                unreliable = offers.reliability == ReliabilityPolicy.BEST_EFFORT \
-                    and wants.reliability == ReliabilityPolicy.RELIABLE
-                unfit = 'reliability' if unreliable else 'qos'
-            has_kind = str(info.topic_type).rsplit('/', 1)[-1]
-            peers.append(diagnosis.Peer(name_of(info), has_kind, unfit))
-        return diagnosis.TopicFigures(topic, kind.__name__, tuple(peers))
+    def offer(
+        kind: type[SetBool] | type[Trigger], name: str,
+        act: Callable[[ControlLoop, bool], None], done: tuple[str, str],
+    ) -> None:
+        """Act upon all loops; the bool, and which text it is done with, is what was asked for."""
+        def serve(request: Any, response: Any) -> Any:
+            wanted = getattr(request, 'data', True)
+            if node.configured:
+                for joint in joints:
+                    act(joint.loop, wanted)
+            response.success = node.configured
+            response.message = done[wanted] if node.configured else unconfigured
+            node.log.info(response.message)
+            return response
 
-    # As the middleware has it: rclpy keeps what was asked for, with zeros for "no limit".
-    offered = [i.qos_profile for i in publishers(to.control) if name_of(i) == own]
-    heard = node.get_subscriptions_info_by_topic(to.control) if offered else []
-    return diagnosis.Neighbours(
-        peers_on(to.output, publishers(to.output), lambda qos: (qos, output_qos(p, DEPTH))),
-        peers_on(to.reference, publishers(to.reference), lambda qos: (qos, io.reference_qos)),
-        peers_on(to.control, heard, lambda qos: (offered[0], qos)), rivals,
+        node.create_service(kind, name, serve)
+
+    async def save(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        files = [joint.p.estimates.file for joint in joints]
+        if not node.configured:
+            response.message = unconfigured
+        elif not any(files):
+            response.message = 'estimates.file is empty, so there is nowhere to save: start with ' \
+                '-p estimates.file:=PATH, or set it while unconfigured'
+        elif not (writings := [each for joint in joints if (each := joint.save())]):
+            response.message = 'nothing was learned yet'
+        else:
+            for writing in writings:
+                # The loop goes on while the disk takes its time.
+                written: Future = Future()
+                writing.add_done_callback(written.set_result)
+                await written
+            why = '; '.join(filter(None, [writing.result() for writing in writings]))
+            response.success = not why
+            response.message = why or f'saved in {", ".join(files)}'
+        return response
+
+    offer(SetBool, '~/freeze_adaptation', lambda loop, frozen: loop.adapt(not frozen),
+          ('the controller learns', 'estimates are held'))
+    offer(SetBool, '~/enable_compensation', lambda loop, on: loop.compensate(on),
+          ('the gap is not compensated', 'the gap is compensated'))
+    offer(Trigger, '~/reset_estimates', lambda loop, _: loop.reset(),
+          ('', 'the estimates are those of estimator.initial'))
+    # In a group of its own, so that it does not keep the others waiting.
+    node.create_service(
+        Trigger, '~/save_estimates', cast(Callable[..., Trigger.Response], save),
+        callback_group=MutuallyExclusiveCallbackGroup(),
     )

@@ -12,10 +12,9 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from backlash_ros import topics
-from backlash_ros.core.loop.diagnosis import UNNAMED
 from backlash_ros.nodes.runtime.driver_io import DriverIo
 from backlash_ros.nodes.runtime.executor import serve_polled
-from backlash_ros.nodes.runtime.messages import SILENT_S, arrival_ns
+from backlash_ros.nodes.runtime.messages import SILENT_S, arrival_ns, name_of
 from backlash_ros.nodes.runtime.process import ProcessNode
 
 # Keys in /diagnostics by which controllers know each other.
@@ -177,13 +176,6 @@ class RivalWatch:
                     return identity_of(info)
             time.sleep(1e-3)
         raise RuntimeError(f'the graph does not show the own publisher of {self.topic}')
-
-
-def name_of(info: TopicEndpointInfo) -> str:
-    # Names are discovered a little later than topics, and programs without ROS have none.
-    if not info.node_name or 'UNKNOWN' in info.node_name:
-        return UNNAMED
-    return f'{info.node_namespace.rstrip("/")}/{info.node_name}'
 
 
 def identity_of(info: TopicEndpointInfo) -> str:

@@ -8,13 +8,14 @@ from math import nan
 from typing import Any, NamedTuple
 
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray
 
 from backlash_ros import topics
+from backlash_ros.core.loop import diagnosis
 from backlash_ros.core.loop.control_loop import Driver
 from backlash_ros.core.loop.sample_counter import Output, Timing
 from backlash_ros.core.parameters import ParameterError, Parameters
@@ -26,6 +27,8 @@ from backlash_ros.nodes.runtime.messages import (
     joint_message,
     line_of,
     message_with,
+    name_of,
+    name_of_type,
     number_of,
 )
 from backlash_ros.nodes.runtime.process import ProcessNode
@@ -179,10 +182,6 @@ class DriverIo:
         return self.heard[topic]
 
     @property
-    def reference_qos(self) -> QoSProfile:
-        return self.heard[self.topics.reference].qos_profile
-
-    @property
     def has_reports(self) -> bool:
         reports = self.heard.get(self.topics.applied)
         return reports is not None and reports.get_publisher_count() > 0
@@ -234,3 +233,36 @@ class DriverIo:
             elif all(row.get(name, len(passed)) < len(passed) for name in names):
                 fields[field] = tuple(passed[row[name]] for name in names)
         return JointMessage(self.now_ns(), names, **fields)
+
+    def neighbours(self, rivals: tuple[str, ...]) -> diagnosis.Neighbours:
+        """Who is on the topics of the controller. rivals: who else publishes v."""
+        node, (y_m, y, v, _, types) = self._node, self.topics
+        publishers, own_name = node.get_publishers_info_by_topic, node.get_fully_qualified_name()
+        # As the middleware has it: rclpy keeps what was asked for, with zeros for "no limit".
+        own = [info for info in publishers(v) if name_of(info) == own_name][:1]
+        references, outputs = self.heard[y_m].qos_profile, output_qos(self._p, DEPTH)
+        # Of each who is there: what is offered and what is wanted.
+        there = {
+            y: [(info, info.qos_profile, outputs) for info in publishers(y)],
+            y_m: [(info, info.qos_profile, references) for info in publishers(y_m)],
+            v: [(info, each.qos_profile, info.qos_profile)
+                for each in own for info in node.get_subscriptions_info_by_topic(v)],
+        }
+        output, reference, control = (
+            diagnosis.TopicFigures(topic, types[topic].__name__, tuple(
+                diagnosis.Peer(name_of(info), info.topic_type.rpartition('/')[2],
+                               _misfit(info.topic_type, types[topic], *qos)) for info, *qos in found
+            )) for topic, found in there.items()
+        )
+        return diagnosis.Neighbours(output, reference, control, rivals)
+
+
+def _misfit(sent: str, kind: type[Any], offers: QoSProfile, wants: QoSProfile) -> str:
+    """Why no message passes, as diagnosis.Peer says it."""
+    if sent != name_of_type(kind):
+        return 'type'
+    if qos_check_compatible(offers, wants)[0] != QoSCompatibility.ERROR:
+        return ''
+    unreliable = offers.reliability == ReliabilityPolicy.BEST_EFFORT \
+        and wants.reliability == ReliabilityPolicy.RELIABLE
+    return 'reliability' if unreliable else 'qos'

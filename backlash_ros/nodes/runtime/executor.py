@@ -4,8 +4,10 @@ All that looks inside of rclpy, of the version of ROS 2 Jazzy, is in this file.
 """
 
 import time
-from typing import Any
+from collections.abc import Callable
+from typing import Any, cast
 
+from lifecycle_msgs.srv import ChangeState
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ShutdownException, SingleThreadedExecutor, TimeoutException
@@ -29,6 +31,22 @@ def serve_polled(subscription: Subscription) -> None:
     while left and (taken := take(subscription.msg_type, subscription.raw)) is not None:
         callback(*taken)
         left -= 1
+
+
+def refuse_unfit_transitions(node: Node) -> None:
+    """Answer a transition that the present state does not have, instead of ending of it."""
+    service = next(s for s in node.services if s.srv_type is ChangeState)
+    change = cast(Callable[..., Any], service.callback)
+
+    def checked(request: ChangeState.Request, response: ChangeState.Response) -> Any:
+        try:
+            return change(request, response)
+        except RuntimeError as error:  # RCLError has no public name
+            node.get_logger().warning(f'no such transition now: {" ".join(str(error).split())}')
+            response.success = False
+            return response
+
+    service.callback = checked
 
 
 class PromptExecutor(SingleThreadedExecutor):

@@ -18,11 +18,12 @@ from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import deserialize_message
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 
 from backlash_ros import topics
-from backlash_ros.core.loop.diagnosis import Finding, Level, LevelLog
+from backlash_ros.core.loop.diagnosis import UNNAMED, Finding, Level, LevelLog
 
 # Deep enough that a recorder which is held up for a second misses nothing.
 DEPTH = 1000
@@ -97,6 +98,14 @@ class DiagnosticsPublisher:
 def line_of(joint: str, text: str) -> str:
     """A line of the log about a joint; the only one is nameless."""
     return f'{joint}: {text}' if joint else text
+
+
+def name_of(info: TopicEndpointInfo) -> str:
+    """Full name of the node that has an endpoint."""
+    # Names are discovered a little later than topics, and programs without ROS have none.
+    if not info.node_name or 'UNKNOWN' in info.node_name:
+        return UNNAMED
+    return f'{info.node_namespace.rstrip("/")}/{info.node_name}'
 
 
 def name_of_type(message_type: type[Any]) -> str:
