@@ -29,7 +29,7 @@ from arm_physics import JOINTS, RESOLUTION, ArmPhysics, Joint
 from joint_trajectory import swing
 
 from backlash_ros.core.assembly import first_guess, known_before
-from backlash_ros.core.identification.motion import Drive, drive_limits, strokes
+from backlash_ros.core.control.motion import Drive, drive_limits
 from backlash_ros.core.loop.control_loop import Driver
 from backlash_ros.core.loop.joint_loops import JointLoops
 from backlash_ros.core.loop.sample_counter import Output, SampleCounter
@@ -73,7 +73,7 @@ def identify_joint(joint: Joint, folder: Path) -> None:
     period_s = Parameters(shared).sample_period
     arm, at, goals = ArmPhysics(), NAMES.index(joint.name), [0.0] * len(JOINTS)
     limits = drive_limits(Parameters(shared), REACH, SPEED)
-    drive, rows = Drive(strokes, limits, period_s, DRIVE_S), ['t,v,y']
+    drive, rows = Drive(limits, period_s, DRIVE_S), ['t,v,y']
     for k in range(round(DRIVE_S / period_s)):
         y, goals[at] = arm.encoders()[at], in_steps(drive.step())
         rows.append(f'{k * period_s:.3f},{goals[at]!r},{y!r}')

@@ -25,7 +25,7 @@ from backlash_ros import topics
 from backlash_ros.core import driver_check
 from backlash_ros.core.assembly import build_controller, build_limits
 from backlash_ros.core.control.limits import plausible
-from backlash_ros.core.identification.motion import Drive, drive_limits, strokes, waves
+from backlash_ros.core.control.motion import Drive, drive_limits
 from backlash_ros.core.parameters.table import CONTROLLER
 from backlash_ros.nodes.control.rivals import CommandLock
 from backlash_ros.nodes.driver_graph import DriverGraph
@@ -58,8 +58,7 @@ class CheckDriverNode(ProcessNode):
         self._options = options
         if options.drive:
             limits = drive_limits(p, options.amplitude, options.rate)
-            self._begin = partial(Drive, strokes if options.messages else waves, limits,
-                                  p.sample_period, options.duration)
+            self._begin = partial(Drive, limits, p.sample_period, options.duration)
         self._motion: Drive | None = None  # v on its way
         self._heard = driver_check.Heard()
         self._file = open(options.messages or os.devnull, 'w', encoding='ascii')  # noqa: SIM115

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from reporting import Array
 from scipy.signal import cont2discrete, lfilter
 
-from backlash_ros.core.identification.motion import strokes
+from backlash_ros.core.control.motion import strokes
 from backlash_ros.core.plant.backlash import play
 
 SECONDS = 10.0

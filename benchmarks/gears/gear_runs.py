@@ -18,9 +18,9 @@ from gear_physics import PRESETS, Gear, GearPhysics
 
 from backlash_ros.core import Parameters, Status, build_controller
 from backlash_ros.core.control.controller import AdaptiveController
+from backlash_ros.core.control.motion import strokes
 from backlash_ros.core.identification.actuator import with_actuator
 from backlash_ros.core.identification.identification import Identification, identify
-from backlash_ros.core.identification.motion import strokes
 from backlash_ros.core.identification.structure_search import Options
 from backlash_ros.core.parameters import ParameterError, Value
 from backlash_ros.tools.identify.outcome import as_estimate, identified_parameters

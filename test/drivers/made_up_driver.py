@@ -7,8 +7,8 @@ from scipy.signal import cont2discrete
 
 from backlash_ros.core import Parameters, build_plant
 from backlash_ros.core.control.limits import Limits
+from backlash_ros.core.control.motion import Drive
 from backlash_ros.core.driver_check import FLOAT64, WRONG, Graph, Heard, Judgement, Message, judge
-from backlash_ros.core.identification.motion import Drive, waves
 
 PERIOD_S = 0.04  # long enough that a busy machine does not disturb it
 NATURAL = 2.0 * pi * 2.0  # rad/s
@@ -56,7 +56,7 @@ def heard_from_driver(
     0, so that the left side is never engaged.
     """
     limits = Limits(-reach * REACH, reach * REACH, RATE * PERIOD_S)
-    drive = Drive(waves, limits, PERIOD_S, samples * PERIOD_S)
+    drive = Drive(limits, PERIOD_S, samples * PERIOD_S)
     plant = build_plant(plant_parameters())
     v: list[float] = []
     y: list[float] = []

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from backlash_ros.core import Parameters, build_plant
+from backlash_ros.core.control.motion import strokes
 from backlash_ros.core.identification.actuator import with_actuator
 from backlash_ros.core.identification.identification import Identification, identify
-from backlash_ros.core.identification.motion import strokes
 from backlash_ros.core.identification.structure_search import Options
 from backlash_ros.core.records.record import Record
 from backlash_ros.tools.identify.outcome import commented_yaml, identified_parameters, write_record

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from backlash_ros.core.control.motion import strokes
 from backlash_ros.core.identification.identification import Identification, identify
 from backlash_ros.core.identification.model import Samples, Structure, first_model, fitted
-from backlash_ros.core.identification.motion import strokes
 from backlash_ros.core.identification.structure_search import Options
 from backlash_ros.core.plant.backlash import play
 

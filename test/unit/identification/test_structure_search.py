@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from backlash_ros.core.control.motion import strokes
 from backlash_ros.core.estimation.posterior import WindowFit
 from backlash_ros.core.identification import model as models
 from backlash_ros.core.identification import structure_search as search
 from backlash_ros.core.identification.identification import identify
-from backlash_ros.core.identification.motion import strokes
 from backlash_ros.core.plant.backlash import play
 
 SAMPLES = models.Samples(np.zeros(2), np.full(2, np.nan), 1, 2, 0.0)

@@ -4,15 +4,12 @@ At several speeds, amplitudes and rests, in both directions: a lag shows as a ga
 the speed, and with one speed only, they could not be told apart.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from itertools import count
-from math import inf, pi, sin
+from math import inf
 
 from backlash_ros.core.control.limits import Limits, at_rest, last_commands
 from backlash_ros.core.parameters import ParameterError, Parameters
-
-# Lowest and highest v, its speed [v/s], sample period [s], duration [s] and first v to its v(k).
-Shape = Callable[[float, float, float, float, float, float], Iterator[float]]
 
 
 def drive_limits(p: Parameters, amplitude: float | None, rate: float | None) -> Limits:
@@ -37,40 +34,23 @@ def drive_limits(p: Parameters, amplitude: float | None, rate: float | None) -> 
 
 
 class Drive:
-    """v(k) along a motion of some shape, from v on, within limits."""
+    """v(k) along strokes, from v on, within limits."""
 
     def __init__(
-        self, shape: Shape, limits: Limits, sample_period: float, duration: float, v: float = 0.0,
+        self, limits: Limits, sample_period: float, duration: float, v: float = 0.0,
     ) -> None:
         self._limits, self._motion = limits, at_rest(v)
-        self._shape = shape(limits.low, limits.high, limits.move / sample_period, sample_period,
-                            duration, v)
+        self._strokes = strokes(limits.low, limits.high, limits.move / sample_period,
+                                sample_period, duration, v)
 
     def step(self) -> float:
         """The next v."""
-        self._motion = self._limits.apply(next(self._shape), self._motion)
+        self._motion = self._limits.apply(next(self._strokes), self._motion)
         return self._motion.v
 
     def to_rest(self) -> Iterator[float]:
         """v from here to 0, or to the limit next to it, where it stays."""
         return last_commands('ramp', self._motion, lambda: self._limits)
-
-
-def waves(
-    low: float, high: float, rate: float, period: float, duration: float, v: float,
-) -> Iterator[float]:
-    """To and fro along two sines from the middle of the range on, as soon as v has got there."""
-    middle, half, move = 0.5 * (low + high), 0.5 * (high - low), rate * period
-    while abs(v - middle) > move:
-        v += move if v < middle else -move
-        yield v
-    # Together they tell a delay from a wider gap; three periods of the slower one.
-    share, faster = 0.3, 2.7
-    x, step = 0.0, period * min(
-        6.0 * pi / duration, rate / (half * (1.0 - share + share * faster)))
-    while True:
-        yield middle + half * ((1.0 - share) * sin(x) + share * sin(faster * x))
-        x += step
 
 
 def strokes(
