@@ -9,9 +9,9 @@ good predictors; of these the least N' log(squares) + unknowns log(N') over all 
 (BIC), with N' = N (1 - r) / (1 + r) for the lag-1 correlation r of the residual.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from math import exp, inf, log, nan, sqrt
+from math import inf, log, nan, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +20,6 @@ from backlash_ros.core.estimation.fit import FEW_STEPS, FIRST_STEPS
 from backlash_ros.core.estimation.posterior import step_of
 from backlash_ros.core.estimation.search import search
 from backlash_ros.core.identification.model import (
-    TINY,
     Model,
     Samples,
     Structure,
@@ -32,7 +31,6 @@ from backlash_ros.core.identification.model import (
 )
 from backlash_ros.core.identification.not_play import Observed, what_it_is
 from backlash_ros.core.identification.verdict import ANOTHER
-from backlash_ros.core.plant.numerics import lfilter
 from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.records.readings import noise_of, outliers, quantum
 
@@ -40,7 +38,7 @@ Progress = Callable[[str], object]
 EARLY, LONGEST_DELAY = (0, 1, 2, 3), 40  # delays that are compared first, and the longest
 GENERAL_POLES = 3  # of the G with which the gap is searched first; it has a tap for each delay
 PLATEAU = 10.0  # difference of the criterion below which two delays are equally good
-RACE_STEPS = 10  # of a fit that tells whether a structure may be the best
+EXACT = 1e-10  # rms over that of y, less than which no error counts: simulations round
 
 
 @dataclass(frozen=True)
@@ -68,7 +66,7 @@ class Units(NamedTuple):
 class Compared(NamedTuple):
     """One structure. trained: fitted to the first part, held_out: its rms error on the last part;
     scatter: relative deviation of that. whole: fitted to all samples. criterion: the smaller the
-    better, inf where it was not fitted to the end."""
+    better."""
 
     structure: Structure
     held_out: float
@@ -204,18 +202,10 @@ def without_outliers(samples: Samples, found: Model) -> Samples:
 def _compare(
     samples: Samples, candidates: Sequence[Model], structures: Sequence[Structure], cut: int,
 ) -> list[Compared]:
-    """Fit the structures, from models whose gap and beginning are about right: some steps on the
-    samples before `cut` tell which may be the best, and only these are fitted to the end."""
+    """Fit the structures to the samples before `cut` and to all of them, from models whose gap and
+    beginning are about right, and from those with a pole less."""
     train, later = replace(samples, last=cut), replace(samples, first=cut)
-
-    def compared(trained: Model, whole: Model) -> Compared:
-        y = later.fitted_y
-        error = (y - _predicted(trained, later))[np.isfinite(y)]
-        rms = float(np.sqrt(np.mean(error**2)))
-        return Compared(whole.structure, rms if np.isfinite(rms) else inf, trained, whole,
-                        scatter=1.0 / sqrt(2.0 * effective(error)))
-
-    first: dict[Structure, Compared] = {}
+    found: dict[Structure, tuple[Model, Model]] = {}
     for kind in sorted({(s.integrator, s.order) for s in structures}):
         alike = [s for s in structures if (s.integrator, s.order) == kind]
         # Poles of this order, and a tap for each of the delays.
@@ -223,53 +213,29 @@ def _compare(
         general = replace(
             one, delay=min(delays), taps=one.numerator_taps + max(delays) - min(delays))
         best = min(first_model(train, general, like.gap, like.fit.p0) for like in candidates)
-        like = fitted(train, general, best.fit, steps=RACE_STEPS)
+        like = fitted(train, general, best.fit, steps=FIRST_STEPS)
         for structure in alike:
             taps = like.numerator[structure.delay - general.delay:]
-            begin = replace(like.fit, theta=np.concatenate([
-                like.fit.theta[:3], structure.xi(taps, like.a)]), x=np.zeros(1))
-            found = fitted(train, structure, begin, steps=RACE_STEPS)
-            first[structure] = compared(found, found)
-    done: dict[Structure, Compared] = {}
-    for structure in sorted(_finalists(_with_criteria(first.values())), key=lambda s: s.order):
-        begins = [first[structure].trained.fit]
-        smaller = done.get(replace(structure, order=structure.order - 1))
-        if smaller is not None:
-            begins += [moved_to(structure, smaller.trained, factor=(1.0, -pole))
-                       for pole in (0.3, 0.85)]
-        trained = fitted(train, structure, *begins, steps=FIRST_STEPS)
-        done[structure] = compared(trained, fitted(samples, structure, trained.fit))
-    finished = {one.structure: one for one in _with_criteria(done.values())}
-    return [finished.get(structure, one) for structure, one in first.items()]
-
-
-def _with_criteria(compared: Iterable[Compared]) -> list[Compared]:
-    """The same with their criteria, and no error less than what a simulation rounds."""
-    compared = list(compared)
-    best = min(one.whole for one in compared)
+            begins = [replace(like.fit, x=np.zeros(1), theta=np.concatenate([
+                like.fit.theta[:3], structure.xi(taps, like.a)]))]
+            smaller = found.get(replace(structure, order=structure.order - 1))
+            if smaller:
+                begins += [moved_to(structure, smaller[0], factor=(1.0, -pole))
+                           for pole in (0.3, 0.85)]
+            trained = fitted(train, structure, *begins, steps=FIRST_STEPS)
+            found[structure] = trained, fitted(samples, structure, trained.fit)
+    best = min(whole for _, whole in found.values())
     count, rows = len(best.left), effective(best.left)
-    # A step of the recursion A y = ... rounds by |A|_1 |y| eps at most, and 1/A hands that on.
-    answer = lfilter([1.0], best.denominator, np.eye(1, len(best.problem.v))[0])
-    rounded = 2.0 * float(np.finfo(float).eps) * float(np.sqrt(np.mean(best.problem.y**2))) \
-        * float(np.abs(best.denominator).sum() * np.linalg.norm(answer))
-    return [one._replace(
-        held_out=max(one.held_out, rounded),
-        criterion=rows * log(max(one.whole.squares, rounded**2 * count, TINY))
-        + one.structure.unknowns * log(max(rows, 1.0)),
-    ) for one in compared]
-
-
-def _finalists(first: Sequence[Compared]) -> list[Structure]:
-    """Structures that may be the best by either measure, with those that they may give way to."""
-    finalists = 4  # by the criterion, and as many by prediction
-    by_criterion = sorted(first, key=lambda one: one.criterion)
-    by_prediction = sorted(first, key=lambda one: one.held_out)
-    good = {one.structure for one in (*by_criterion[:finalists], *by_prediction[:finalists])}
-    good |= {replace(by_criterion[0].structure, delay=one.structure.delay) for one in first}
-    for _ in range(2):  # what they give way to may have a pole that is cancelled as well
-        good |= {Structure(s.order - 1, s.delay, also)
-                 for s in good for also in (False, s.integrator)}
-    return [one.structure for one in first if one.structure in good]
+    compared = []
+    for structure, (trained, whole) in found.items():
+        error = later.fitted_y - _predicted(trained, later)
+        error = error[np.isfinite(later.fitted_y)]
+        rms = float(np.sqrt(np.mean(error**2)))
+        compared.append(Compared(
+            structure, max(rms, EXACT) if np.isfinite(rms) else inf, trained, whole,
+            rows * log(max(whole.squares, EXACT**2 * count))
+            + structure.unknowns * log(max(rows, 1.0)), 1.0 / sqrt(2.0 * effective(error))))
+    return compared
 
 
 def selected(compared: Sequence[Compared]) -> Compared:
@@ -282,9 +248,8 @@ def selected(compared: Sequence[Compared]) -> Compared:
 
 
 def _eligible(compared: Sequence[Compared]) -> list[Compared]:
-    """Structures that were fitted to the end, without those that are no model if there are others.
-    """
-    found = [one for one in compared if np.isfinite(one.criterion)]
+    """Structures without those that are no model, if there are others."""
+    found = list(compared)
     for useless in (_explains_nothing, _rings):
         found = [one for one in found if not useless(one.whole)] or found
     return found
@@ -341,39 +306,25 @@ def _predicted(found: Model, later: Samples) -> Array:
 
 
 def later(early: StructureSearch, options: Options, progress: Progress) -> StructureSearch:
-    """The search among later delays, where one of them explains y as well or better: the same
-    structure is fitted with one sample of delay more and more, from the fit before."""
-    worse_for = 3  # delays in a row that fit worse, behind which no later one is tried
-    alike_by = 5.0  # log-likelihood by which a delay that fits alike may be worse
-    best, latest = early.best, min(LONGEST_DELAY, len(early.samples.v) // 20)
-    progress('searching later delays')
-    samples = replace(early.samples, first=latest + 1)
-    scan = [fitted(samples, best.structure, best.fit)]
-    alike, rows = list(scan), effective(scan[0].left)
-    while scan[-1].structure.delay < min(latest, alike[-1].structure.delay + worse_for):
-        before = scan[-1]
-        structure = replace(best.structure, delay=before.structure.delay + 1)
-        anew = first_model(samples, structure, before.gap, before.fit.p0, (0.6,))
-        scan.append(fitted(samples, structure, moved_to(structure, before), anew.fit,
-                           steps=FIRST_STEPS))
-        most = min(one.squares for one in scan) * exp(2.0 * alike_by / rows)
-        alike = [one for one in scan if one.squares <= most]
-    first, last = (alike[k].structure.delay for k in (0, -1))
-    if last <= EARLY[-1]:
-        return early
-    early = early._replace(apart=max(early.apart, by_model(best.gap, [
-        (one.gap, one.behind(scan[0], rows)) for one in alike])))
-    # What no G with a backlash explains, any delay explains a little better.
-    if what_it_is(observed_of(early.samples, best, Units())):
-        return early
-    # Poles may stand for a part of a delay: where many fit alike, it is one of the last.
-    late = searched(early.samples.v, early.samples.y, options, range(
-        max(first - 1, last - 5, 0), min(last + 2, latest) + 1), progress)
-    rows = effective(late.best.left)
-    better = rows * log(max(best.rms, TINY) / max(late.best.rms, TINY)) + 0.5 * log(rows) * (
-        best.structure.unknowns - late.best.structure.unknowns)
-    # Very strong evidence (Kass and Raftery, J. Am. Stat. Assoc. 90 (1995) 773-795).
-    return late if late.best.structure.delay < max(late.delays) and better > 5.0 else early
+    """The search among later delays, as long as the latest one explains y as well as any."""
+    latest = min(LONGEST_DELAY, len(early.samples.v) // 20)
+    while (last := max(early.delays)) < latest and last in equal_delays(
+            early.compared, early.chosen):
+        # What no G with a backlash explains, any delay explains a little better.
+        if what_it_is(observed_of(early.samples, early.best, Units())):
+            break
+        progress('searching later delays')
+        late = searched(early.samples.v, early.samples.y, options,
+                        range(last, min(last + len(EARLY), latest) + 1), progress)
+        rows, best = effective(late.best.left), early.best
+        better = rows * log(max(best.rms, EXACT) / max(late.best.rms, EXACT)) + 0.5 * log(rows) * (
+            best.structure.unknowns - late.best.structure.unknowns)
+        # Very strong evidence (Kass and Raftery, J. Am. Stat. Assoc. 90 (1995) 773-795).
+        if better <= 5.0:
+            return early._replace(apart=max(early.apart, by_model(
+                best.gap, [(late.best.gap, -2.0 * better)])))
+        early = late
+    return early
 
 
 def observed_of(samples: Samples, best: Model, units: Units) -> Observed:
