@@ -17,14 +17,16 @@ import numpy as np
 from backlash_ros.core.estimation.fit import FIRST_STEPS
 from backlash_ros.core.identification import model as models
 from backlash_ros.core.identification import structure_search as search
-from backlash_ros.core.identification.model import VAGUE, Model, Structure, fitted, moved_to
-from backlash_ros.core.identification.not_play import Observed, limited, rate_limit
-from backlash_ros.core.identification.structure_search import (
-    Options,
-    Progress,
-    StructureSearch,
+from backlash_ros.core.identification.model import (
+    VAGUE,
+    Model,
+    Structure,
     Units,
+    fitted,
+    moved_to,
 )
+from backlash_ros.core.identification.not_play import Observed, limited, rate_limit
+from backlash_ros.core.identification.structure_search import Options, Progress, StructureSearch
 from backlash_ros.core.identification.verdict import CERTAIN, Findings, Verdict, judge
 from backlash_ros.core.plant.actuator import Actuator
 from backlash_ros.core.plant.transfer_function import Array
@@ -130,18 +132,17 @@ def identify(
     units = Units(float(v.mean()), float(np.ptp(v[part])), float(np.nanmedian(y)),
                   float(np.nanstd(y[part])))
     v, y = (v - units.v) / units.v_size, (y - units.y) / units.y_size
-    s = search.searched(v[part], y[part], options, options.delays or search.EARLY, progress)
+    s = search.searched(
+        v[part], y[part], units, options, options.delays or search.EARLY, progress)
     if not options.delays:
         s = search.later(s, options, progress)
     progress('fitting the whole record')
     best, samples, rows = s.best, s.samples, models.effective(s.best.left)
-    structures = [replace(best.structure, delay=delay)
-                  for delay in search.equal_delays(s.compared, s.chosen)]
-    others = [fitted(samples, one, moved_to(one, best)) for one in structures
-              if one != best.structure]
     # With as many poles, some of them may fit worse.
-    best = models.least_response(
-        best, [one for one in others if one.behind(best, rows) <= search.PLATEAU])
+    best = models.least_response(best, [
+        one.whole for one in s.compared if one.whole.behind(best, rows) <= search.PLATEAU
+        and one.structure != best.structure == replace(
+            one.structure, delay=best.structure.delay)])
     if len(v) > len(samples.v):
         whole = y.copy()
         whole[part] = samples.y
@@ -156,7 +157,7 @@ def identify(
     s = s._replace(samples=samples, best=best, held_out=s.held_out._replace(
         first=part.start + s.held_out.first))
     progress('judging')
-    found = _as_a_gain(_described(s, given, options, units), s, options, units)
+    found = _as_a_gain(_described(s, given, options), s, options)
     return found if slow is None else found.with_remarks(
         f'v jumps, and the drive follows by at most {slow / sample_period:.4g} per s: the fit is '
         'to v limited so, as is control.rate_max in the file', *found.remarks)
@@ -181,44 +182,36 @@ def _why_nothing(v: Array, y: Array, options: Options) -> str:
     return ''
 
 
-def _crossings(best: Model, covariance: Array, units: Units) -> tuple[float, Array]:
-    """c_r, and the covariance of (gap, c_r), shape (2, 2)."""
+def _crossings(best: Model, covariance: Array, units: Units) -> tuple[float, list[float]]:
+    """c_r, and the variances of gap, c_r and c_l."""
     taps = best.structure.numerator_taps
     b, a = float(best.numerator.sum()), 1.0 + float(best.a.sum())
     # Unless G integrates, the middle of y is part of the offset.
     shift = 0.0 if best.structure.integrator or not b else units.y / units.y_size * a / b
-    c_r = units.v + units.v_size * (float(best.fit.theta[1]) - shift)
-    jacobian = np.zeros((2, len(covariance)))
-    jacobian[0, 2] = jacobian[1, 1] = units.v_size
-    jacobian[1, 3:3 + taps] = VAGUE * units.v_size * shift / b if b else 0.0
-    jacobian[1, 3 + taps:] = -VAGUE * units.v_size * shift / a if a else 0.0
-    return c_r, np.asarray(jacobian @ covariance @ jacobian.T)
+    of_gap, of_c_r = np.zeros((2, len(covariance)))
+    of_gap[2] = of_c_r[1] = 1.0
+    of_c_r[3:3 + taps], of_c_r[3 + taps:] = VAGUE * shift / (b or inf), -VAGUE * shift / (a or inf)
+    by = units.v_size * np.array([of_gap, of_c_r, of_c_r - of_gap])
+    return units.v + units.v_size * (float(best.fit.theta[1]) - shift), \
+        np.maximum(np.diag(by @ covariance @ by.T), 0.0).tolist()
 
 
-def _described(
-    s: StructureSearch, given: Identification, options: Options, units: Units,
-) -> Identification:
+def _described(s: StructureSearch, given: Identification, options: Options) -> Identification:
     """Everything there is to say of the best fit."""
-    best, structure = s.best, s.best.structure
+    best, structure, units = s.best, s.best.structure, s.samples.units
     covariance = models.covariance_of(best.problem, best.fit)
-    c_r, crossings = _crossings(best, covariance, units)
-    gap_var, c_r_var = np.diag(crossings).tolist()
-    c_l_var = max(gap_var + c_r_var - 2.0 * float(crossings[0, 1]), 0.0)
+    c_r, (gap_var, c_r_var, c_l_var) = _crossings(best, covariance, units)
     g = models.response_of(best, covariance, units.y_size / units.v_size)
     low, high = frequencies_of(best.run.y)
     low = max(low, np.pi / len(best.run.y))
     frequencies = np.geomspace(low, max(high, 1.01 * low), 60, dtype=np.float64)
     spread, gain_std = g.std(frequencies), float(g.std(np.zeros(1))[0])
     middle, still = np.sqrt(frequencies[:1] * frequencies[-1:]), _still(best)
-    first, measured, simulated, rms, trained = s.held_out
-    held_out = search.HeldOut(first, units.y + units.y_size * measured,
-                       units.y + units.y_size * simulated, units.y_size * rms,
-                       units.y_size * trained)
     delays = tuple(sorted({*search.equal_delays(s.compared, s.chosen), structure.delay}))
-    observed, total = search.observed_of(s.samples, best, units), float(g.numerator.sum())
+    observed, total = search.observed_of(s.samples, best), float(g.numerator.sum())
     static = total if structure.integrator else total / float(g.denominator.sum())
     verdict = judge(Findings(
-        observed, sqrt(gap_var), units.v_size * s.apart, sqrt(max(c_r_var, 0.0)),
+        observed, sqrt(gap_var), units.v_size * s.apart, sqrt(c_r_var),
         float(np.copysign(np.abs(g.at(middle))[0], static)), gain_std, float(spread.max()),
         # Whatever the correlation: what explains nine tenths of y shows v.
         inf if best.squares < 0.1 * still.squares
@@ -242,7 +235,7 @@ def _described(
             units.y_size * sqrt(best.squares / max(len(best.left) - structure.unknowns, 1)),
             quantum(observed.y), int((np.isfinite(given.y) & np.isnan(s.samples.y)).sum())),
         details=Details(s.samples.first, units.v + units.v_size * best.problem.v, observed, g,
-                        held_out))
+                        s.held_out))
 
 
 def _delay_open(s: StructureSearch) -> bool:
@@ -262,26 +255,28 @@ def _still(best: Model) -> Model:
     return replace(best, fit=problem.begun(still, True))
 
 
-def _as_a_gain(
-    found: Identification, s: StructureSearch, options: Options, units: Units,
-) -> Identification:
+def _as_a_gain(found: Identification, s: StructureSearch, options: Options) -> Identification:
     """With a G that is a gain and a delay, where a better one is not known but the gap is: a slow
     log of a position servo tells no more; what moves y otherwise counts as an error of G."""
     gains = [one for one in s.compared if one.structure.order == 0]
-    if not gains or not (found.verdict and found.verdict.backlash.known) \
-            or found.verdict.model.known:
+    if not gains or not _known(found, False):
         return found
-    chosen = min(gains, key=lambda one: one.whole.squares)
+    chosen, v_size = min(gains, key=lambda one: one.whole.squares), s.samples.units.v_size
     best = fitted(s.samples, chosen.structure, chosen.trained.fit)
     # What depends on the model.
-    apart = s.apart + 0.5 * abs(best.gap - found.gap / units.v_size)
-    gain = _described(s._replace(chosen=chosen, best=best, apart=apart), found, options, units)
-    if not (gain.verdict and gain.verdict.backlash.known and gain.verdict.model.known) \
-            or apart * units.v_size >= CERTAIN * found.std['gap']:
+    apart = s.apart + 0.5 * abs(best.gap - found.gap / v_size)
+    gain = _described(s._replace(chosen=chosen, best=best, apart=apart), found, options)
+    if not _known(gain, True) or apart * v_size >= CERTAIN * found.std['gap']:
         return found
     moved = sqrt(best.squares / float(np.var(best.problem.y[best.problem.known])) / len(best.left))
     uncertainty = max(gain.model.uncertainty, _as_parameter(2.0 * moved))
     return replace(gain, model=gain.model._replace(uncertainty=uncertainty))
+
+
+def _known(found: Identification, model: bool) -> bool:
+    """Whether the backlash is known, and G is or is not."""
+    return found.verdict is not None and found.verdict.backlash.known \
+        and found.verdict.model.known == model
 
 
 def _as_parameter(spread: float) -> float:

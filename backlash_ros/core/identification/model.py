@@ -82,6 +82,18 @@ class Structure:
         return np.append(padded(numerator, self.numerator_taps), a) / VAGUE
 
 
+class Units(NamedTuple):
+    """Middle and size of v and of y, by which both are centred and scaled."""
+
+    v: float
+    v_size: float
+    y: float
+    y_size: float
+
+
+ALREADY = Units(0.0, 1.0, 0.0, 1.0)  # of signals that are centred and scaled
+
+
 @dataclass(frozen=True)
 class Samples:
     """A record (N,), centred and scaled, y nan where lost; [first, last): the y that are fitted.
@@ -93,6 +105,7 @@ class Samples:
     first: int
     last: int
     step: float
+    units: Units = ALREADY
 
     @property
     def fitted_y(self) -> Array:
@@ -209,19 +222,11 @@ def first_model(
 
 def autocorrelation(residual: Array, lags: int) -> Array:
     """Of a residual with nan where it is not known, lags 0 to `lags`; 1 first."""
-    known, size = np.isfinite(residual), len(residual)
-    products, pairs = (_convolved(x, x[::-1])[size - 1:size + lags]
-                       for x in (np.where(known, residual, 0.0), known.astype(float)))
+    known = np.isfinite(residual)
+    spectra = np.fft.rfft([np.where(known, residual, 0.0), known], 2 * len(residual))
+    products, pairs = np.fft.irfft(np.abs(spectra)**2)[:, :lags + 1]
     covariance = products / np.maximum(np.round(pairs), 1.0)
     return np.asarray(covariance / covariance[0]) if covariance[0] > 0.0 else np.eye(lags + 1)[0]
-
-
-def _convolved(a: Array, b: Array) -> Array:
-    """The whole convolution along the first axis; that of SciPy costs a start of 0.3 s."""
-    count = len(a) + len(b) - 1
-    size = 2 ** (count - 1).bit_length()
-    product = np.fft.rfft(a, size, axis=0) * np.fft.rfft(b, size, axis=0)
-    return np.asarray(np.fft.irfft(product, size, axis=0)[:count])
 
 
 def covariance_of(problem: Problem, f: WindowFit) -> Array:
@@ -241,10 +246,10 @@ def covariance_of(problem: Problem, f: WindowFit) -> Array:
     lasts = 1.1447 * (4.0 * r**2 / (1.0 - r**2) ** 2 * rows) ** (1.0 / 3.0)
     lags = max(round(max(sqrt(rows), min(lasts, 0.25 * rows))), 1)
     taper = autocorrelation(residual, lags) * (1.0 - np.arange(lags + 1) / (lags + 1.0))
-    q[~np.append(problem.known, np.zeros(len(q) - count, dtype=bool))] = 0.0
-    middle = q[:count].T @ _convolved(
-        q[:count], np.append(taper[:0:-1], taper)[:, None])[lags:lags + count]
-    values, vectors = np.linalg.eigh(0.5 * (middle + middle.T))
+    of_rows = np.fft.fft(q[:count] * problem.known[:, None], 2 * count, axis=0)
+    spectrum = 2.0 * np.fft.fft(taper, 2 * count).real - taper[0]
+    middle = (of_rows.conj().T @ (spectrum[:, None] * of_rows)).real / (2 * count)
+    values, vectors = np.linalg.eigh(middle)
     root = np.linalg.pinv(upper, rcond=1e-12) @ vectors \
         * np.sqrt(variance * np.maximum(values, 1.0)) / size[:, None]
     matrix, at = root @ root.T, len(root) - len(f.theta)

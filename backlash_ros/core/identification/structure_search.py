@@ -23,6 +23,7 @@ from backlash_ros.core.identification.model import (
     Model,
     Samples,
     Structure,
+    Units,
     by_model,
     effective,
     first_model,
@@ -54,15 +55,6 @@ class Options:
     held_out: float = 1.0 / 3.0
 
 
-class Units(NamedTuple):
-    """Middle and size of v and of y, by which both are centred and scaled."""
-
-    v: float = 0.0
-    v_size: float = 1.0
-    y: float = 0.0
-    y_size: float = 1.0
-
-
 class Compared(NamedTuple):
     """One structure. trained: fitted to the first part, held_out: its rms error on the last part;
     scatter: relative deviation of that. whole: fitted to all samples. criterion: the smaller the
@@ -78,7 +70,7 @@ class Compared(NamedTuple):
 
 class HeldOut(NamedTuple):
     """Prediction of samples (M,) that were not fitted, from `first` on; rms of its error, and of
-    the fit to the samples before."""
+    the fit to the samples before; all in units of the record."""
 
     first: int
     measured: Array
@@ -102,12 +94,12 @@ class StructureSearch(NamedTuple):
 
 
 def searched(
-    v: Array, y: Array, options: Options, delays: Sequence[int], progress: Progress,
+    v: Array, y: Array, units: Units, options: Options, delays: Sequence[int], progress: Progress,
 ) -> StructureSearch:
-    """The best structure with one of these delays."""
+    """The best structure with one of these delays, of v and y (N,) that are centred and scaled."""
     far_off = 0.03  # relative distance of the last gap from the first, with which to begin anew
     progress('searching the gap')
-    samples = Samples(v, y, max(delays) + 1, len(v), step_of(y))
+    samples = Samples(v, y, max(delays) + 1, len(v), step_of(y), units)
     found = _with_general(samples, delays)
     kept = without_outliers(samples, found[0])
     # Where rounding is the least of what is left, readings are no intervals.
@@ -139,8 +131,10 @@ def searched(
     rivals = [(one.gap, 0.5 * one.behind(best, rows)) for one in models
               if abs(one.gap - best.gap) > ANOTHER * best.gap]
     later = replace(samples, first=cut)
-    held_out = HeldOut(cut, later.fitted_y, _predicted(chosen.trained, later), chosen.held_out,
-                       chosen.trained.rms)
+    measured, simulated = (units.y + units.y_size * y for y in (
+        later.fitted_y, _predicted(chosen.trained, later)))
+    held_out = HeldOut(cut, measured, simulated, units.y_size * chosen.held_out,
+                       units.y_size * chosen.trained.rms)
     return StructureSearch(
         samples, compared, chosen, best, rivals, held_out, delays, by_model(best.gap, [
             (one.whole.gap, one.criterion - chosen.criterion) for one in compared]))
@@ -206,24 +200,12 @@ def _compare(
     beginning are about right, and from those with a pole less."""
     train, later = replace(samples, last=cut), replace(samples, first=cut)
     found: dict[Structure, tuple[Model, Model]] = {}
-    for kind in sorted({(s.integrator, s.order) for s in structures}):
-        alike = [s for s in structures if (s.integrator, s.order) == kind]
-        # Poles of this order, and a tap for each of the delays.
-        delays, one = [s.delay for s in alike], alike[0]
-        general = replace(
-            one, delay=min(delays), taps=one.numerator_taps + max(delays) - min(delays))
-        best = min(first_model(train, general, like.gap, like.fit.p0) for like in candidates)
-        like = fitted(train, general, best.fit, steps=FIRST_STEPS)
-        for structure in alike:
-            taps = like.numerator[structure.delay - general.delay:]
-            begins = [replace(like.fit, x=np.zeros(1), theta=np.concatenate([
-                like.fit.theta[:3], structure.xi(taps, like.a)]))]
-            smaller = found.get(replace(structure, order=structure.order - 1))
-            if smaller:
-                begins += [moved_to(structure, smaller[0], factor=(1.0, -pole))
-                           for pole in (0.3, 0.85)]
-            trained = fitted(train, structure, *begins, steps=FIRST_STEPS)
-            found[structure] = trained, fitted(samples, structure, trained.fit)
+    for structure in sorted(structures, key=lambda s: s.order):
+        begin = min(first_model(train, structure, like.gap, like.fit.p0) for like in candidates)
+        smaller = found.get(replace(structure, order=structure.order - 1))
+        also = [moved_to(structure, smaller[0], factor=(1.0, -0.6))] if smaller else []
+        trained = fitted(train, structure, begin.fit, *also, steps=FIRST_STEPS)
+        found[structure] = trained, fitted(samples, structure, trained.fit)
     best = min(whole for _, whole in found.values())
     count, rows = len(best.left), effective(best.left)
     compared = []
@@ -311,10 +293,10 @@ def later(early: StructureSearch, options: Options, progress: Progress) -> Struc
     while (last := max(early.delays)) < latest and last in equal_delays(
             early.compared, early.chosen):
         # What no G with a backlash explains, any delay explains a little better.
-        if what_it_is(observed_of(early.samples, early.best, Units())):
+        if what_it_is(observed_of(samples := early.samples, early.best)):
             break
         progress('searching later delays')
-        late = searched(early.samples.v, early.samples.y, options,
+        late = searched(samples.v, samples.y, samples.units, options,
                         range(last, min(last + len(EARLY), latest) + 1), progress)
         rows, best = effective(late.best.left), early.best
         better = rows * log(max(best.rms, EXACT) / max(late.best.rms, EXACT)) + 0.5 * log(rows) * (
@@ -327,9 +309,9 @@ def later(early: StructureSearch, options: Options, progress: Progress) -> Struc
     return early
 
 
-def observed_of(samples: Samples, best: Model, units: Units) -> Observed:
-    """The signals of a fit; v at the same samples as y."""
-    v0, v_size, y0, y_size = units
+def observed_of(samples: Samples, best: Model) -> Observed:
+    """The signals of a fit in units of the record; v at the same samples as y."""
+    v0, v_size, y0, y_size = samples.units
     known, y = best.problem.known, samples.fitted_y
     noise = max(noise_of(np.flatnonzero(known).astype(float), y[known]), quantum(y) / sqrt(12.0))
     return Observed(v0 + v_size * samples.v[samples.first:samples.last], y0 + y_size * y,
