@@ -218,30 +218,6 @@ def rate_limit(v: Array, y: Array) -> float | None:
     return float(family.swing * largest * 2.0**octaves)
 
 
-def _ended(v: Array, width: float, low: float, high: float, beyond: float = 0.0) -> Array:
-    """Play with two ends, and a share of its motion beyond these."""
-    p = centred(v, width)
-    within = np.clip(p, min(low, high), max(low, high))
-    return np.asarray(within + beyond * (p - within))
-
-
-def _end(o: Observed, at: At) -> str:
-    f, (width, low, high) = o.family, at
-    squares = [f.solved(f.columns(_ended(f.v, width, low, high, beyond)))[0]
-               for beyond in (0.0, 0.3)]
-    p = centred(f.v, width)
-    on, y = max(((float(beyond.max()), f.target[beyond[f.rows] > 0.0])
-                 for beyond in (p - max(low, high), min(low, high) - p)), key=lambda end: end[0])
-    # A y that only moves less there is at no end.
-    there = squares[0] <= squares[1] and on >= 0.1 and len(y)
-    return _at_end(float(np.median(y)), f.swing * on) if there else ''
-
-
-def _at_end(y: float, on: float) -> str:
-    return (f'y stays at about {y:.4g} while v goes on by {on:.3g} and more: the sensor is at its '
-            'end, or the load slides there')
-
-
 def _many(v: Array, widest: float, share: float) -> Array:
     """Plays of all widths up to the widest in parallel, and a share of v itself beside them."""
     widths = abs(widest) * np.linspace(0.04, 0.96, 12, dtype=np.float64)
@@ -289,7 +265,8 @@ def _held(o: Observed) -> str:
         on = [float(np.max((o.v[run] - o.v[run[0]]) * way * np.sign(along)))
               for run in _runs(np.abs(o.y - end) < within)]
         if abs(along) > 0.3 and sum(size > far for size in on) >= 3:
-            return _at_end(float(end), max(on))
+            return (f'y stays at about {float(end):.4g} while v goes on by {max(on):.3g} and more: '
+                    'the sensor is at its end, or the load slides there')
     return ''
 
 
@@ -326,21 +303,23 @@ def _creep(o: Observed) -> str:
 
 # --- what is compared -----------------------------------------------------------------------------
 
-# A nonlinearity, where to begin (of the width of the best play), what to say of it by its sizes [v]
-# and ends [v], and the cure.
+# A nonlinearity, where to begin (of the width of the best play), what to say of it by its
+# parameters as sizes [v] and as places [v], and the cure.
 NONLINEARITIES: tuple[tuple[
     Callable[..., Array], Callable[[float], Sequence[At]], str, str], ...
 ] = (
-    (_ended, lambda width: [
-        (one, low, high) for one in (width, 0.0)
-        for low, high in ((-1.0, 0.75), (0.25, 2.0), (0.2, 0.8), (0.35, 0.65))],
-     '', 'move v less far'),
+    (lambda v, width, low, high: np.clip(centred(v, width), min(low, high), max(low, high)),
+     lambda width: [
+         (one, low, high) for one in (width, 0.0)
+         for low, high in ((-1.0, 0.75), (0.25, 2.0), (0.2, 0.8), (0.35, 0.65))],
+     'y stays where it is while v goes on below {places[1]:.4g} or above {places[2]:.4g}: the '
+     'sensor is at its end, or the load slides there', 'move v less far'),
     (lambda v, low, high: v - np.clip(v, min(low, high), max(low, high)),
      lambda _: [(middle - half, middle + half) for middle in (0.3, 0.5, 0.7)
                 for half in (0.03, 0.1, 0.2, 0.3)],
-     'v does nothing from {ends[0]:.4g} to {ends[1]:.4g}, from wherever it comes: a dead zone, '
-     'which has no memory, and no backlash', 'remove it where it is made, it is not compensated '
-     'here'),
+     'v does nothing from {places[0]:.4g} to {places[1]:.4g}, from wherever it comes: a dead '
+     'zone, which has no memory, and no backlash',
+     'remove it where it is made, it is not compensated here'),
     (lambda v, width: 2.0 * v - centred(v, width),  # play, compensated twice
      lambda _: [(width,) for width in (0.003, 0.01, 0.03, 0.1, 0.2, 0.4)],
      'y leads v by {:.3g} where v turns: the drive compensates a backlash already, by too much',
@@ -361,8 +340,10 @@ def what_it_is(o: Observed) -> Answer | None:
     """What else than one play y shows; None where one explains it."""
     if not o.unexplained:
         return None
-    beside = ((test(o), cure) for test, cure in BESIDE_V)
-    return next((Answer(False, *one) for one in beside if one[0]), None) or best_other(o)
+    for test, cure in BESIDE_V:
+        if reason := test(o):
+            return Answer(False, reason, cure)
+    return best_other(o)
 
 
 def best_other(o: Observed) -> Answer | None:
@@ -371,7 +352,6 @@ def best_other(o: Observed) -> Answer | None:
     for nonlinearity, starts, said, cure in NONLINEARITIES:
         best = f.best(nonlinearity, starts(abs(o.one_play.at[0])))
         if f.beats(best, o.one_play, o.noise):
-            text = said.format(*(f.swing * abs(x) for x in best.at),
-                               ends=sorted(f.low + f.swing * x for x in best.at))
-            named.append((best.squares, text or _end(o, best.at), cure))
-    return next((Answer(False, *one[1:]) for one in sorted(named) if one[1]), None)
+            at = f.swing * np.array(best.at)
+            named.append((best.squares, said.format(*np.abs(at), places=f.low + at), cure))
+    return Answer(False, *min(named)[1:]) if named else None

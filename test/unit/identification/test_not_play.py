@@ -61,8 +61,8 @@ def observed(v: Array, y: Array, gap: float = GAP, noise: float = NOISE) -> not_
 
 OTHERS: dict[str, tuple[Callable[[Array], Array], str]] = {
     'play, then a load that slides': (
-        lambda v: np.clip(play(v, 0.3), -1.5, 1.5), 'y stays at about'),
-    'the same on one side': (lambda v: np.minimum(play(v, 0.3), 1.2), 'y stays at about'),
+        lambda v: np.clip(play(v, 0.3), -1.5, 1.5), 'the load slides there'),
+    'the same on one side': (lambda v: np.minimum(play(v, 0.3), 1.2), 'the load slides there'),
     'dead zone': (dead_zone, 'a dead zone'),
     'compensated already': (lambda v: 2.0 * v - play(v, 0.3), 'the drive compensates'),
     'plays in parallel': (
