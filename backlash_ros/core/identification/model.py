@@ -13,11 +13,11 @@ beyond those lags over which it lasts. No variance is less than that of white no
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import inf, log, nan, sqrt
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.polynomial.polynomial import polyval
@@ -179,41 +179,50 @@ def moved_to(
     return WindowFit(np.zeros(1), fit.p0 if p0 is None else p0, begin, fit.noise_std)
 
 
-def first_model(
-    samples: Samples, structure: Structure, gap: float, p0: float,
-    filters: Sequence[float] = (0.6, 0.95),
-) -> Model:
-    """The best model by Steiglitz and McBride for a play of this gap and beginning: least squares
-    in A and B, all filtered by 1/A of the step before; filters: poles of the first ones."""
+def steiglitz_mcbride(
+    y: Array, follows: Callable[[Array], Array], poles: int, rows: NDArray[Any], steps: int = 3,
+) -> Iterator[tuple[Array, Array]]:
+    """A with so many poles, and weights (C,) of what A y (N,) follows, from two first filters.
+
+    Least squares over these rows in A and weights, with y and all that it follows filtered by 1/A
+    of the step before. follows: that (C, N), filtered so, by A.
+    """
     inside = 0.999  # where poles outside of the unit circle are put
-    problem, taps, poles = samples.problem(structure), structure.numerator_taps, \
-        structure.free_poles
-    known, count = problem.known, len(problem.v)
-    moves = np.vstack([play(problem.v, gap, p0), np.ones(count)])
-    y = np.interp(np.arange(count), np.flatnonzero(known), problem.y[known])
-    found = []
-    for pole in filters if poles else filters[:1]:
+    for pole in (0.6, 0.95) if poles else (0.0,):
         a: Array = np.atleast_1d(np.poly([pole] * poles))
-        for _ in range(3 if poles else 1):
-            # A y over A: with an integrator in both, 1 - 1/z cancels.
+        for _ in range(steps if poles else 1):
             back = lfilter([1.0], a, y)
-            whole = np.asarray(np.convolve(a, (1.0, -1.0))) if structure.integrator else a
-            moved, constant = lfilter([1.0], whole, moves)
-            columns = np.vstack([
-                delayed(moved, taps), -delayed(back, poles + 1)[1:], constant,
-                state_columns(padded(whole, structure.states + 1).tolist(), count).T, back])
-            r = np.asarray(np.linalg.qr(columns[:, known].T, mode='r'))
+            columns = np.vstack([-delayed(back, poles + 1)[1:], follows(a), back])
+            r = np.asarray(np.linalg.qr(columns[:, rows].T, mode='r'))
             solution = np.linalg.lstsq(r[:, :-1], r[:, -1], rcond=1e-13)[0]
-            a = np.append(1.0, solution[taps:taps + poles])
+            a = np.append(1.0, solution[:poles])
             roots = np.roots(a)
             size = np.abs(roots)
             if size.max(initial=0.0) > inside:
                 a = np.real(np.poly(roots * np.minimum(inside / np.maximum(size, inside), 1.0)))
-        b, gain = solution[:taps], float(solution[:taps].sum())
-        offset = -float(solution[taps + poles]) / gain if gain else 0.0
+        yield a, solution[poles:]
+
+
+def first_model(samples: Samples, structure: Structure, gap: float, p0: float) -> Model:
+    """The best model by Steiglitz and McBride for a play of this gap and beginning."""
+    problem, taps, count = samples.problem(structure), structure.numerator_taps, \
+        len(samples.fitted_y)
+    known = problem.known
+    moves = np.vstack([play(problem.v, gap, p0), np.ones(count)])
+
+    def follows(a: Array) -> Array:
+        # A y over A: with an integrator in both, 1 - 1/z cancels.
+        whole = np.asarray(np.convolve(a, (1.0, -1.0))) if structure.integrator else a
+        moved, constant = lfilter([1.0], whole, moves)
+        of_state = state_columns(padded(whole, structure.states + 1).tolist(), count).T
+        return np.vstack([delayed(moved, taps), constant, of_state])
+
+    y, found = np.interp(np.arange(count), np.flatnonzero(known), problem.y[known]), []
+    for a, weights in steiglitz_mcbride(y, follows, structure.free_poles, known):
+        b, gain = weights[:taps], float(weights[:taps].sum())
+        offset = -float(weights[taps]) / gain if gain else 0.0
         theta = np.concatenate([[1.0, offset, gap], structure.xi(b, a[1:])])
-        fit = WindowFit(solution[len(solution) - structure.states:], p0, theta, 1.0)
-        found.append(Model(structure, problem, fit))
+        found.append(Model(structure, problem, WindowFit(weights[taps + 1:], p0, theta, 1.0)))
     return min(found)
 
 
