@@ -3,6 +3,7 @@
 import sys
 import time
 from collections import Counter
+from collections.abc import Sequence
 from functools import partial
 from math import inf, isfinite
 from typing import Any
@@ -49,9 +50,8 @@ class PlantNode(ProcessNode):
         self._truth = messages.LabelledArrayPublisher(
             self, topics.of_node(topics.TRUTH), topics.TRUTH_LABELS
         )
-        self._truth_rows: list[tuple[float, ...]] = []  # that wait until y has left
         self.listen(Float64, topics.CONTROL, self._on_control, 1)
-        name, start = self.resolve_topic_name, self._offer if p.lockstep else lambda: None
+        name, start = self.resolve_topic_name, self._answer if p.lockstep else lambda: None
         self.log.info(f'started: {name(topics.CONTROL)} in, {name(topics.PLANT_OUTPUT)} out, '
                       f'sample_period {p.sample_period:g} s')
         self.start_when(self._is_heard, start, f'subscribers of {topics.PLANT_OUTPUT}')
@@ -88,55 +88,59 @@ class PlantNode(ProcessNode):
         self._held.take(v, messages.arrival_ns(info['received_timestamp']))
         expected, self._expecting = self._expecting, False
         if expected and self.settings.lockstep:
-            self._advance(v)
-            self._offer()
+            self._answer(v)
 
-    def _offer(self) -> None:
+    def _answer(self, *acted: float) -> None:
         """Lockstep: go on to the next output that is not lost on purpose."""
-        while not (self._complete or self._publish_output()):
-            self._advance(self._held.newest)
-        self._end_sample()
+        while not self._go_on(acted):
+            acted = (self._held.newest,)
 
     def _keep_time(self, executor: PromptExecutor) -> None:
-        """Real time: advance and publish y at absolute deadlines, all else after y has left."""
+        """Real time: go on at absolute deadlines."""
         period_ns = self.settings.sample_period * 1e9
-        start, tick = time.monotonic_ns(), -1
+        start, tick = time.monotonic_ns(), 0
+        self._go_on(())
         while not (self.stopping or self._complete):
             remaining = start + (tick + 1) * period_ns - time.monotonic_ns()
             if remaining <= 0:
                 # What has arrived in time counts, even if nobody has looked at it yet.
                 executor.serve_urgent(0)
-                # Where the process was held up past a deadline, the tick jumps.
-                before = max(tick, 0)
-                tick = max(tick + 1, int((time.monotonic_ns() - start) / period_ns))
-                self._on_tick(tick - before, start + int(tick * period_ns))
+                # More than one where the process was held up past a deadline.
+                passed = max(int((time.monotonic_ns() - start) / period_ns) - tick, 1)
+                tick += passed
+                due_ns = start + int(tick * period_ns)
+                # Some of these intervals may have been over before v came; all that has come so far
+                # came within the newest one. Later than latest_ns y would look like the next one.
+                self._go_on([
+                    self._held.over(due_ns - missed * period_ns if missed else inf)
+                    for missed in reversed(range(passed))
+                ], latest_ns=due_ns + 0.75 * period_ns)
                 executor.look_if_due()
             elif remaining >= 3_000_000:  # a wait of the executor costs more than less leaves
                 executor.spin_once(timeout_sec=remaining * 1e-9)
             else:
                 executor.serve_urgent(int(remaining))
 
-    def _on_tick(self, passed: int, due_ns: int) -> None:
-        """Simulate the periods that have passed, the last one until due_ns, and publish y."""
-        period_ns = self.settings.sample_period * 1e9
-        # Of the intervals that ended while the process was held up, some were over before v came.
-        for missed in reversed(range(passed)):
-            # All that has come so far came within the newest interval.
-            self._advance(self._held.over(due_ns - missed * period_ns if missed else inf))
-        if not self._complete:
-            # Later than this an output would look like the next one.
-            self._publish_output(latest_ns=due_ns + 0.75 * period_ns)
-        self._end_sample()
+    def _go_on(self, acted: Sequence[float], latest_ns: float = inf) -> bool:
+        """Apply a v over each period that has passed, and publish y, all else after it has left.
 
-    def _advance(self, v: float) -> None:
+        Returns whether it has left, or the run is complete.
+        """
+        rows = [self._advance(v) for v in acted if not self._complete]
+        finished = self._complete or self._publish_output(latest_ns)
+        for row in rows:
+            self._truth.publish(row)
         if self._complete:
-            return
+            stepped = dict.fromkeys((topics.APPLIED_CONTROL, topics.TRUTH), self._plant.sample)
+            emit('done', published={**self._published, **stepped})
+        return finished
+
+    def _advance(self, v: float) -> tuple[float, ...]:
+        """Let v act over a period; returns the row of the truth of it."""
         plant, sample = self._plant, self._plant.sample
-        u = plant.step(v)
-        truth = plant.backlash
-        self._truth_rows.append((u, truth.m, truth.c_r, truth.c_l, v, float(sample)))
-        applied = self._outgoing[topics.APPLIED_CONTROL]
-        applied.publish(messages.message_with(plant.applied))
+        u, truth = plant.step(v), plant.backlash
+        self._outgoing[topics.APPLIED_CONTROL].publish(messages.message_with(plant.applied))
+        return u, truth.m, truth.c_r, truth.c_l, v, float(sample)
 
     def _publish_output(self, latest_ns: float = inf) -> bool:
         """Measure y, and publish it unless it is lost on purpose or too late."""
@@ -157,14 +161,6 @@ class PlantNode(ProcessNode):
     @property
     def _complete(self) -> bool:
         return 0 < self.settings.samples <= self._plant.sample
-
-    def _end_sample(self) -> None:
-        for row in self._truth_rows:
-            self._truth.publish(row)
-        self._truth_rows.clear()
-        if self._complete:
-            stepped = dict.fromkeys((topics.APPLIED_CONTROL, topics.TRUTH), self._plant.sample)
-            emit('done', published={**self._published, **stepped})
 
 
 main = partial(run, PLANT, PlantNode)

@@ -3,10 +3,10 @@
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from math import isfinite, nan
+from math import inf, isfinite, nan
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +15,12 @@ from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 from rclpy.time import Time
-from rosbags.interfaces import Connection
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray
 
 from backlash_ros import topics
 from backlash_ros.bags import REPAIR_COMMAND, Bag, RecordingError, repair_command
 from backlash_ros.core.loop.diagnosis import Finding, Level
-from backlash_ros.core.loop.sample_counter import UNNUMBERED
 from backlash_ros.core.parameters import RECORDER
 from backlash_ros.nodes.runtime import messages
 from backlash_ros.nodes.runtime.driver_io import driver_topics, output_qos
@@ -36,21 +34,18 @@ RECORDER_DEPTH = 10_000  # messages that may wait while the disk is slow
 @dataclass
 class RecordedTopic:
     subscription: Subscription
-    connection: Connection | None = None
+    connection: Any = None  # of the bag, if there is one
     newest: bytes = b''  # serialised
     received: int = 0
-    recorded: int = 0
-    missed: int = 0
-    sequence: int = UNNUMBERED  # of the newest message
 
     @property
     def name(self) -> str:
         return str(self.subscription.topic_name)
 
-
-def _row(topic: str, message: bytes) -> dict[str, float]:
-    data = deserialize_message(message, Float64MultiArray).data if message else ()
-    return dict(zip(topics.LABELS_OF[topic], data, strict=False))
+    def row(self, labels: Sequence[str]) -> dict[str, float]:
+        """The newest message of an array topic by label, without more than the first joint."""
+        data = deserialize_message(self.newest, Float64MultiArray).data if self.newest else ()
+        return dict(zip(labels, data, strict=False))
 
 
 class RecorderNode(ProcessNode):
@@ -64,7 +59,8 @@ class RecorderNode(ProcessNode):
         p, self.failure = self.settings, ''
         self._now_ns: int | None = 0 if p.lockstep else None  # simulated time
         self._channels: dict[str, RecordedTopic] = {}
-        self._first_signals = b''
+        self._before = inf  # samples before the first one that was heard
+        self._unrecorded = 0  # messages that came without a bag
         self._bag = self._open_bag(p.bag, p.storage) if p.bag else None
         self.log.info(f'started: records to {p.bag} ({p.storage})' if p.bag else
                       'started: nothing is recorded, as the parameter bag names no folder')
@@ -95,38 +91,32 @@ class RecorderNode(ProcessNode):
 
     def work(self, executor: PromptExecutor) -> None:
         super().work(executor)
-        # What has arrived belongs into the bag. Five times, as timers are served in between; a
-        # signal has to end it within a second.
-        deadline, idle = time.monotonic() + 0.3, 0
-        while idle < 5 and time.monotonic() < deadline:
-            received = self._received
-            executor.spin_once(timeout_sec=0.0)
-            idle = idle + 1 if received == self._received else 0
+        # What has arrived belongs into the bag; a signal has to end it within a second.
+        deadline = time.monotonic() + 0.3
+        while executor.serve_urgent(10_000_000) and time.monotonic() < deadline:
+            pass
 
     def finish(self) -> None:
-        bag, channels = self._bag, self._channels.values()
-        if self._with_bag(Bag.close) and bag:
+        self._with_bag(Bag.close)
+        if bag := self._bag:
             self.log.info(
                 f'recorded {bag.saved} messages of {bag.saved_ns * 1e-9:.1f} s to {bag.path}'
             )
-            output = self._channels.get(driver_topics(self.settings).output)
-            if self._first_signals and not (output and output.recorded):
+            output = driver_topics(self.settings).output
+            if self._channels[topics.SIGNALS].received and output not in self._heard:
                 self._complain(
-                    'the bag holds no output of the driver, which the controller has heard: the '
-                    'recorder did not discover its publisher before the end; let the driver wait '
-                    'until its output has two subscribers, or run longer'
+                    f'the controller has heard {output}, of which the bag holds nothing: its '
+                    'publisher was not discovered here before the end; let the driver wait until '
+                    'its output has two subscribers, or run longer'
                 )
-        for channel in channels:
-            if channel.missed:
-                self.log.warning(f'{channel.missed} messages of {channel.name} were missed')
         if self.failure:
-            unrecorded = self._received - sum(channel.recorded for channel in channels)
-            self.log.warning(f'{unrecorded} messages came after the recording had stopped')
-        emit('closed', messages={channel.name: channel.recorded for channel in channels})
+            self.log.warning(f'{self._unrecorded} messages came after the recording had stopped')
+        emit('closed', messages={each.name: each.received for each in self._channels.values()})
 
     @property
-    def _received(self) -> int:
-        return sum(channel.received for channel in self._channels.values())
+    def _heard(self) -> dict[str, int]:
+        """How many messages of each topic were heard, if any."""
+        return {topic: each.received for topic, each in self._channels.items() if each.received}
 
     def _open_bag(self, path: str, storage: str) -> Bag:
         bag = Bag(path, storage)
@@ -136,26 +126,22 @@ class RecorderNode(ProcessNode):
                 'power cut loses everything. Install the version that requirements/run.txt names'
             )
         diagnostics = messages.DiagnosticsPublisher(self, path)
-
-        def diagnose() -> None:
-            finding = Finding(Level.OK, 'recording', f'recording to {path}')
-            if self.failure:
-                finding = Finding(Level.ERROR, 'stopped', 'recording stopped, all else goes on')
-            # The log has it already.
-            diagnostics.publish(finding, {'reason': self.failure}, logs=False)
-
-        self.every(messages.DIAGNOSTICS_PERIOD_S, diagnose)
+        well = Finding(Level.OK, 'recording', f'recording to {path}')
+        failed = Finding(Level.ERROR, 'stopped', 'recording stopped, all else goes on')
+        # The log has it already.
+        self.every(messages.DIAGNOSTICS_PERIOD_S, lambda: diagnostics.publish(
+            failed if self.failure else well, {'reason': self.failure}, logs=False
+        ))
         # A crash or a power cut costs half a second, with the time that a flush takes.
         self.every(0.4, lambda: self._with_bag(Bag.flush))
         return bag
 
-    def _with_bag(self, action: Callable[[Bag], None]) -> bool:
-        """Do something with the bag; returns whether there is one and it went well."""
+    def _with_bag(self, action: Callable[[Bag], Any]) -> Any:
+        """Do something with the bag, if there is one; there is none any more where it fails."""
         if (bag := self._bag) is None:
-            return False
+            return None
         try:
-            action(bag)
-            return True
+            return action(bag)
         except RecordingError as error:
             self._bag, self.exit_code = None, FAILED
             self.failure = (
@@ -164,35 +150,26 @@ class RecorderNode(ProcessNode):
                 f'{REPAIR_COMMAND} {bag.path}'
             )
             self._complain(self.failure)
-            return False
+            return None
 
     def _complain(self, text: str) -> None:
         self.log.error(text)
         emit('complaint', text=text)
 
     def _record(self, topic: str, message_type: type[Any], qos: QoSProfile | int) -> None:
-        channel = self._channels[topic] = RecordedTopic(
-            self.listen(message_type, topic, partial(self._on_message, topic), qos, raw=True)
-        )
-
-        def announce(bag: Bag) -> None:
-            channel.connection = bag.add_topic(channel.name, messages.name_of_type(message_type))
-
-        self._with_bag(announce)
+        callback = partial(self._on_message, topic)
+        subscription = self.listen(message_type, topic, callback, qos, raw=True)
+        self._channels[topic] = RecordedTopic(subscription, self._with_bag(
+            lambda bag: bag.add_topic(subscription.topic_name, messages.name_of_type(message_type))
+        ))
 
     def _on_message(self, topic: str, message: bytes, info: dict[str, Any]) -> None:
-        channel, sequence = self._channels[topic], info['publication_sequence_number']
+        channel = self._channels[topic]
         channel.received += 1
         channel.newest = message
-        # Each of several publishers has numbers of its own.
-        if UNNUMBERED not in (sequence, channel.sequence) and topic != topics.DIAGNOSTICS:
-            channel.missed += max(sequence - channel.sequence - 1, 0)
-        channel.sequence = sequence
-        if (connection := channel.connection) is not None:
-            stamp_ns = info['source_timestamp'] if self._now_ns is None else self._now_ns
-            channel.recorded += self._with_bag(lambda bag: bag.write(connection, stamp_ns, message))
-        if topic == topics.SIGNALS:
-            self._first_signals = self._first_signals or message
+        stamp_ns = info['source_timestamp'] if self._now_ns is None else self._now_ns
+        self._with_bag(lambda bag: bag.write(channel.connection, stamp_ns, message))
+        self._unrecorded += self._bag is None
 
     def _on_clock(self, message: Clock) -> None:
         self._now_ns = Time.from_msg(message.clock).nanoseconds
@@ -200,17 +177,17 @@ class RecorderNode(ProcessNode):
     def _tell(self) -> None:
         """Say how the run is going, of its first joint if it has several."""
         signals, estimates = (
-            _row(topic, self._channels[topic].newest)
+            self._channels[topic].row(topics.LABELS_OF[topic])
             for topic in (topics.SIGNALS, topics.ESTIMATES)
         )
-        received = {topic: channel.received for topic, channel in self._channels.items()}
-        first = _row(topics.SIGNALS, self._first_signals).get('sample', nan)
         # A joint that was not answered has nan for everything.
         samples = [row.get('sample', nan) for row in (signals, estimates)]
-        if all(map(isfinite, (*samples, first))):
+        if all(map(isfinite, samples)):
+            unheard = samples[0] + 1 - self._channels[topics.SIGNALS].received
+            self._before = min(self._before, unheard)
             emit(
-                'progress', sample=int(min(samples)), received=received,
-                lost=int(signals['sample'] - first) + 1 - received[topics.SIGNALS],
+                'progress', sample=int(min(samples)), received=self._heard,
+                lost=int(unheard - self._before),
                 **{name: estimates[name] for name in topics.BACKLASH},
             )
 
