@@ -27,8 +27,8 @@ from backlash_ros.core.assembly import build_controller, build_limits
 from backlash_ros.core.control.limits import plausible
 from backlash_ros.core.control.motion import Drive, drive_limits
 from backlash_ros.core.parameters.table import CONTROLLER
+from backlash_ros.nodes import driver_graph
 from backlash_ros.nodes.control.rivals import CommandLock
-from backlash_ros.nodes.driver_graph import DriverGraph
 from backlash_ros.nodes.runtime.executor import PromptExecutor
 from backlash_ros.nodes.runtime.messages import DEPTH, name_of
 from backlash_ros.nodes.runtime.process import ProcessNode, run, split_arguments
@@ -62,9 +62,10 @@ class CheckDriverNode(ProcessNode):
         self._motion: Drive | None = None  # v on its way
         self._heard = driver_check.Heard()
         self._file = open(options.messages or os.devnull, 'w', encoding='ascii')  # noqa: SIM115
-        self._names = {topic: self.resolve_topic_name(topic) for topic in self._heard.by_topic}
-        self._graph = DriverGraph(self, self._names)
-        self._lock = CommandLock(self.context.get_domain_id(), self._names[topics.CONTROL])
+        self._graph = driver_check.Graph()  # with the most of them that were there at once
+        self._control_topic = self.resolve_topic_name(topics.CONTROL)
+        self._output_topic = self.resolve_topic_name(topics.PLANT_OUTPUT)
+        self._lock = CommandLock(self.context.get_domain_id(), self._control_topic)
         self._control: Publisher
         self._answers = False
         self._settled_at = self._newest_at = inf  # everybody found everybody; the newest y came
@@ -79,11 +80,11 @@ class CheckDriverNode(ProcessNode):
         self.exit_code = self._tell()
 
     def _finds_driver(self, executor: PromptExecutor) -> bool:
-        reminder = self.every(3.0, self._graph.say_what_is_missing)
+        reminder = self.every(3.0, lambda: driver_graph.say_what_is_missing(self))
         deadline, found = time.monotonic() + self._options.wait, False
         while not (found or self.stopping or time.monotonic() > deadline):
             executor.spin_once(timeout_sec=LOOK_S)
-            found = bool(self._graph.publishers(topics.PLANT_OUTPUT))
+            found = bool(driver_graph.publishers(self, topics.PLANT_OUTPUT))
         self.destroy_timer(reminder)
         return found and not self.stopping
 
@@ -109,21 +110,21 @@ class CheckDriverNode(ProcessNode):
 
     def _look(self) -> None:
         """Take note of who is there. Once heard, a rival counts, even if it leaves."""
-        self._graph.look()
+        self._graph = max(driver_graph.graph_around(self), self._graph,
+                          key=lambda graph: (graph.publishers, graph.listeners))
         self._file.flush()
         if not self._options.drive:
             return
-        rivals, now = {*map(name_of, self._graph.publishers(topics.CONTROL))}, time.monotonic()
+        rivals = {name_of(info) for info in driver_graph.publishers(self, topics.CONTROL)}
+        now, p = time.monotonic(), self.settings
         if now > self._settled_at:
             if not self._lock.take():
                 rivals = rivals or {'a controller of this machine'}
             self._answers = self._control.get_subscription_count() > 0
         self._rivals = self._rivals or ', '.join(sorted(rivals))
-        p = self.settings
         patience_s = max(p.timeout.plant_output, 10.0 * p.sample_period)
         if self._answers and now > self._newest_at + patience_s:
-            self._ended = f'nothing was heard on {self._names[topics.PLANT_OUTPUT]} for ' \
-                f'{patience_s:g} s'
+            self._ended = f'nothing was heard on {self._output_topic} for {patience_s:g} s'
 
     def _hear(self, topic: str) -> None:
         """Subscribe the way that hears whoever publishes, whatever the QoS."""
@@ -136,7 +137,7 @@ class CheckDriverNode(ProcessNode):
                 message.data, info['source_timestamp'], info['received_timestamp'],
                 info['publication_sequence_number']))
 
-        self.listen(Float64, topic, on_message, self._graph.profile(topic))
+        self.listen(Float64, topic, on_message, driver_graph.profile(self, topic))
 
     def _note(self, topic: str, message: driver_check.Message) -> None:
         self._heard.by_topic[topic].append(message)
@@ -190,20 +191,20 @@ class CheckDriverNode(ProcessNode):
 
     def _tell(self) -> int:
         """Say what came of it; returns the exit code."""
-        options, heard, names = self._options, self._heard, self._names
+        options, heard = self._options, self._heard
         if self._rivals:
-            self._say(f'{names[topics.CONTROL]} is published by {self._rivals}: stop that first, '
+            self._say(f'{self._control_topic} is published by {self._rivals}: stop that first, '
                       'or leave --drive out')
             return BAD_INPUT
         if options.messages:
             if self._ended:
                 self._say(f'{self._ended}: drive ended')
             if self._motion is None:
-                why = f'nobody subscribes to {names[topics.CONTROL]}' if heard.outputs \
-                    else f'nothing was heard on {names[topics.PLANT_OUTPUT]}'
+                why = f'nobody subscribes to {self._control_topic}' if heard.outputs \
+                    else f'nothing was heard on {self._output_topic}'
                 self._say(f'the actuator was not moved: {why}')
             return FAILED if self._motion is None else DONE
-        findings = driver_check.judge(self._graph.in_the_end(), heard, self.settings)
+        findings = driver_check.judge(self._graph, heard, self.settings)
         if self._ended:
             findings.append(driver_check.Judgement(
                 'drive', driver_check.WRONG, f'{self._ended}: drive ended',

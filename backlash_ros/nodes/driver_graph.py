@@ -1,7 +1,7 @@
 """What discovery tells of a driver: who publishes y, who listens to v, with which QoS."""
 
 import difflib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 from rclpy.node import Node
 from rclpy.qos import QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
@@ -13,62 +13,52 @@ from backlash_ros.core.parameters.table import RECORDER
 from backlash_ros.nodes.runtime.messages import DEPTH
 
 
-class DriverGraph:
-    """The topics of a loop as a node sees them. names: their full names."""
+def publishers(node: Node, topic: str) -> list[TopicEndpointInfo]:
+    """Who else publishes a topic."""
+    return [info for info in node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
+            if info.node_name != node.get_name()]
 
-    def __init__(self, node: Node, names: Mapping[str, str]) -> None:
-        self._node, self._names = node, names
-        self._graph = Graph()
 
-    def publishers(self, topic: str) -> list[TopicEndpointInfo]:
-        """Who else publishes a topic."""
-        return [info for info in self._node.get_publishers_info_by_topic(self._names[topic])
-                if info.node_name != self._node.get_name()]
+def profile(node: Node, topic: str) -> QoSProfile:
+    """The QoS that hears whoever publishes a topic."""
+    return QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT if
+                      _has_best_effort(publishers(node, topic)) else ReliabilityPolicy.RELIABLE)
 
-    def profile(self, topic: str) -> QoSProfile:
-        """The QoS that hears whoever publishes a topic."""
-        return QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT if
-                          _has_best_effort(self.publishers(topic)) else ReliabilityPolicy.RELIABLE)
 
-    def look(self) -> None:
-        """Take note of who is there now."""
-        graph, outputs = self._graph, self.publishers(topics.PLANT_OUTPUT)
-        listeners = self._others(
-            self._node.get_subscriptions_info_by_topic(self._names[topics.CONTROL]))
-        graph.publishers = max(graph.publishers, len(outputs))
-        graph.listeners = max(graph.listeners, len(listeners))
-        if outputs:
-            graph.types = tuple(sorted({info.topic_type for info in outputs}))
-        graph.best_effort |= _has_best_effort(outputs)
-        misfits = {_misfit(info.qos_profile) for info in listeners} - {''}
-        graph.misfits = tuple(sorted({*graph.misfits, *misfits}))
+def graph_around(node: Node) -> Graph:
+    """Who is there now and, where nobody listens to v, which topics may have been meant for it."""
+    control = node.resolve_topic_name(topics.CONTROL)
+    outputs = publishers(node, topics.PLANT_OUTPUT)
+    listeners = _others(node, node.get_subscriptions_info_by_topic(control))
+    return Graph(
+        len(outputs), tuple(sorted({info.topic_type for info in outputs})), len(listeners),
+        tuple(sorted({_misfit(info.qos_profile) for info in listeners} - {''})),
+        _has_best_effort(outputs), () if listeners else
+        similar_topics(control, _topics(node, node.get_subscriptions_info_by_topic)))
 
-    def in_the_end(self) -> Graph:
-        """All that was noted, with topics that may have been meant for v."""
-        listened_to = self._topics(self._node.get_subscriptions_info_by_topic)
-        self._graph.near_control = similar_topics(self._names[topics.CONTROL], listened_to)
-        return self._graph
 
-    def say_what_is_missing(self) -> None:
-        """Say which topic is waited for, and which ones there are."""
-        wanted = self._names[topics.PLANT_OUTPUT]
-        seen = self._topics(self._node.get_publishers_info_by_topic)
-        print(f'waiting for {wanted} ({FLOAT64}), sees {", ".join(sorted(seen)) or "no topic"}',
-              flush=True)
-        for near in similar_topics(wanted, seen):
-            print(f'  if {near} ({", ".join(seen[near])}) is it: --ros-args -r '
-                  f'{topics.PLANT_OUTPUT}:={near}', flush=True)
+def say_what_is_missing(node: Node) -> None:
+    """Say which topic is waited for, and which ones there are."""
+    wanted = node.resolve_topic_name(topics.PLANT_OUTPUT)
+    seen = _topics(node, node.get_publishers_info_by_topic)
+    print(f'waiting for {wanted} ({FLOAT64}), sees {", ".join(sorted(seen)) or "no topic"}', *(
+        f'  if {near} ({", ".join(seen[near])}) is it: '
+        f'--ros-args -r {topics.PLANT_OUTPUT}:={near}' for near in similar_topics(wanted, seen)
+    ), sep='\n', flush=True)
 
-    def _topics(self, endpoints: Callable[[str], list[TopicEndpointInfo]]) -> dict[str, list[str]]:
-        """Topics that others have such endpoints of, with their types, but for those of ROS."""
-        return {topic: types for topic, types in self._node.get_topic_names_and_types()
-                if topic not in ('/rosout', '/parameter_events') and self._others(endpoints(topic))}
 
-    def _others(self, endpoints: Sequence[TopicEndpointInfo]) -> list[TopicEndpointInfo]:
-        """Without those of this node, of the recorder and of `ros2 topic`."""
-        own = (self._node.get_name(), RECORDER)
-        return [info for info in endpoints
-                if info.node_name not in own and not info.node_name.startswith('_ros2cli')]
+def _topics(
+    node: Node, endpoints: Callable[[str], list[TopicEndpointInfo]],
+) -> dict[str, list[str]]:
+    """Topics that others have such endpoints of, with their types, but for those of ROS."""
+    return {topic: types for topic, types in node.get_topic_names_and_types()
+            if topic not in ('/rosout', '/parameter_events') and _others(node, endpoints(topic))}
+
+
+def _others(node: Node, endpoints: Sequence[TopicEndpointInfo]) -> list[TopicEndpointInfo]:
+    """Without those of this node, of the recorder and of `ros2 topic`."""
+    return [info for info in endpoints if info.node_name not in (node.get_name(), RECORDER)
+            and not info.node_name.startswith('_ros2cli')]
 
 
 def _has_best_effort(endpoints: Sequence[TopicEndpointInfo]) -> bool:

@@ -80,13 +80,13 @@ class ReferenceNode(ProcessNode):
         outputs = self._io.listen(hear, depth=1, polled=True)
         diagnostics = self.listen(
             DiagnosticArray, topics.DIAGNOSTICS, self._hear_diagnostics, 10, polled=True
-        ) if pace.waits else None
+        )
         serve_at = now
         while not self.stopping:
             if now >= serve_at:
                 executor.spin_once(timeout_sec=0.0)
                 serve_at = now + 0.05  # between two looks at signals and requests
-                if diagnostics is not None and pace.waits:
+                if pace.waits:
                     serve_polled(diagnostics)
                     # Fast DDS may miss a process of another machine for good that starts at the
                     # same moment.
@@ -96,9 +96,6 @@ class ReferenceNode(ProcessNode):
                             f'{self._io.topics.output} is not heard here, but by the controller: '
                             'y_m goes by the own clock; start the driver some seconds before'
                         )
-                elif diagnostics is not None:
-                    self.destroy_subscription(diagnostics)
-                    diagnostics = None
             if pace.listens(now):
                 serve_polled(outputs)
                 now = time.monotonic()
