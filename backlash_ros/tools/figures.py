@@ -1,4 +1,4 @@
-"""Every figure of `report` and `compare`, and what others draw theirs with."""
+"""Every figure of `report`, `compare` and `identify`, and what others draw theirs with."""
 
 import io
 from collections.abc import Mapping, Sequence
@@ -13,6 +13,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Status
+from backlash_ros.core.identification.identification import Details, Identification
+from backlash_ros.core.identification.model import autocorrelation
 from backlash_ros.core.plant.backlash import Backlash
 from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.simulation.run_record import SETTLING_TOLERANCE, RunRecord, delayed_reference
@@ -36,9 +38,13 @@ WHOLE_RUN = Part('Whole run', slice(None))
 matplotlib.style.use(Path(__file__).with_suffix('.mplstyle'))
 
 
-def new_figure(height: float, **others: Any) -> Figure:
-    """Figure of the common width that needs no display."""
-    return Figure(figsize=(10.0, height), **others)
+def new_figure(height: float, laid_out: bool = True) -> Figure:
+    """Figure of the common width that needs no display; not laid out: margins that suit most."""
+    figure = Figure(figsize=(10.0, height), constrained_layout=laid_out)
+    if not laid_out:  # which takes as long as to draw it
+        figure.subplots_adjust(left=0.1, right=0.985, bottom=0.55 / height,
+                               top=1.0 - 0.4 / height, wspace=0.2, hspace=0.4)
+    return figure
 
 
 def png(figure: Figure) -> bytes:
@@ -270,4 +276,81 @@ def draw_log(run: RunRecord) -> Figure:
     for room, x, y in (('a', 't', 'v'), ('b', 't', 'y'), ('c', 'v', 'y')):
         curve(rooms[room], run.column(x), run.column(y), HUES[y], width=0.9)
         label(rooms[room], y=y, x='v' if x == 'v' else TIME_LABEL)
+    return figure
+
+
+def draw_held_out(found: Identification, details: Details) -> Figure:
+    """Measured and simulated y on samples that were held out, and the difference."""
+    first, y, simulated, rms, _ = details.held_out
+    t, figure = _times(found, first, simulated), new_figure(6.2, laid_out=False)
+    upper, lower = draw_panels(figure, {
+        'y': [(t, y, HUES['y'], 'measured', '-', 2.2),
+              (t, simulated, HUES['u_d'], 'simulated', '--')],
+        'difference': [(t, y - simulated, HUES['e'])],
+    }, height_ratios=[2.2, 1.0])[:, 0]
+    label(upper, f'{1.0 - rms / max(float(np.nanstd(y)), 1e-300):.2%} of the motion is predicted')
+    legend_above(upper)
+    zero_line(lower)
+    return figure
+
+
+def _times(found: Identification, first: int, values: Array) -> Array:
+    return found.sample_period * np.arange(first, first + len(values), dtype=float)
+
+
+def draw_loop(found: Identification, details: Details) -> Figure:
+    """y over v as measured, and what the backlash that was found takes from v."""
+    newest, figure = slice(-4000, None), new_figure(4.6, laid_out=False)
+    left, right = figure.subplots(1, 2)
+    v, o = details.v[newest], details.observed
+    curve(left, v, o.y[newest], HUES['y'], width=0.8)
+    label(left, 'As measured', 'y', 'v')
+    curve(right, v, v - o.p[newest] + found.c_r, HUES['u'], width=0.8)
+    for name, value in (('c_r', found.c_r), ('c_l', found.c_l)):
+        right.axhline(value, color=HUES[name], linewidth=4.0, alpha=0.5,
+                      label=f'${name}$ = {value:.4g}')
+    label(right, 'As found', 'v − u / m', 'v')
+    legend_above(right)
+    return figure
+
+
+def draw_residual(found: Identification, details: Details) -> Figure:
+    """y minus the simulation of the whole record: over time, autocorrelated, and over v."""
+    figure, residual = new_figure(6.6, laid_out=False), details.observed.residual
+    over_time, correlated, over_v = figure.subplot_mosaic('tt;cv').values()
+    curve(over_time, _times(found, details.first, residual), residual, HUES['e'], width=0.8)
+    label(over_time, f'Deviation {found.model.noise_std:.3g}', 'residual', TIME_LABEL)
+    bound = 2.0 / np.sqrt(np.isfinite(residual).sum())
+    r = autocorrelation(residual, 60)[1:]
+    correlated.axhspan(-bound, bound, color='#bbbbbb', alpha=0.5, linewidth=0)
+    correlated.vlines(np.arange(1, len(r) + 1), 0.0, r, color=HUES['e'], linewidth=1.5)
+    correlated.set_ylim(*limits([np.append(r, [-3.0 * bound, 3.0 * bound])], 0.1))
+    label(correlated, 'Autocorrelation', x='lag [samples]')
+    over_v.plot(details.v, residual, '.', color=HUES['e'], markersize=2, alpha=0.4,
+                rasterized=True)
+    label(over_v, 'Over v', x='v')
+    for axes in (over_time, correlated, over_v):
+        zero_line(axes)
+    return figure
+
+
+def draw_bode(found: Identification, details: Details) -> Figure:
+    """Frequency response of m G with two standard deviations; dotted: where y moved."""
+    figure = new_figure(5.6, laid_out=False)
+    w = np.geomspace(max(found.model.frequencies[0] / 5.0, 1e-5), 0.98 * np.pi, 400)
+    f = w / (2.0 * np.pi * found.sample_period)
+    value = details.response.at(w) * np.exp(-1j * w * found.model.delay)
+    spread = 2.0 * details.response.std(w)
+    size, angle = np.abs(value), np.degrees(np.unwrap(np.angle(value)))
+    turn = np.degrees(np.arcsin(np.minimum(spread, 1.0)))
+    magnitude, phase = draw_panels(figure, {
+        '|m G| [y/v]': [(f, size, HUES['m'])], 'degrees': [(f, angle, HUES['m'])]})[:, 0]
+    band(magnitude, f, size * np.maximum(1.0 - spread, 1e-3), size * (1.0 + spread), HUES['m'])
+    band(phase, f, angle - turn, angle + turn, HUES['m'])
+    for edge in found.hertz[[0, -1]]:
+        for axes in (magnitude, phase):
+            axes.axvline(edge, color='#444444', linestyle=':', linewidth=1.0)
+    label(magnitude, 'Magnitude')
+    label(phase, 'Phase', x='frequency [Hz]')
+    magnitude.set(xscale='log', yscale='log', ylim=(size.min() / 3.0, size.max() * 3.0))
     return figure

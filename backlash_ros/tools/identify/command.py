@@ -4,11 +4,12 @@ import argparse
 import os
 import sys
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 from backlash_ros.core.parameters import Value
-from backlash_ros.options import FAILED, OptionParser, add_motion_options, positive
-from backlash_ros.tools.cli import add_options, run_tool, span_of
+from backlash_ros.options import DONE, FAILED, OptionParser, add_motion_options, positive
+from backlash_ros.tools.cli import ONE_THREAD, add_options, run_tool, span_of
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -65,18 +66,8 @@ def _share(text: str) -> float:
     return number
 
 
-def main(args: Sequence[str] | None = None) -> int:
-    """Entry point of `identify`."""
-    # The matrices are small: more threads of BLAS would cost more than they bring.
-    os.environ.setdefault('OMP_NUM_THREADS', '1')
-    os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-    known: list[bool] = []
-    code = run_tool('identify', lambda given: known.append(_identify(given)), args)
-    return FAILED if known == [False] else code
-
-
-def _identify(args: Sequence[str] | None) -> bool:
-    """Do what the options say; returns whether the backlash is known."""
+def _identify(args: Sequence[str] | None) -> int:
+    os.environ.update({**ONE_THREAD, **os.environ})
     parser = make_parser()
     arguments = list(sys.argv[1:] if args is None else args)
     # Names of topics are changed as for every node.
@@ -93,19 +84,22 @@ def _identify(args: Sequence[str] | None) -> bool:
         from backlash_ros.tools.config import read_configuration
         configuration = read_configuration(options.config)
         given = configuration.given(options.axis if configuration.axes else '')
+    told = options.period or given.get('sample_period')
+    period = told if isinstance(told, float) else None
     if options.drive:
         from backlash_ros.tools.identify.drive import drive
         if options.axis:
             ros_arguments = [*(ros_arguments or ['--ros-args']), '-r', f'__ns:=/{options.axis}']
-        record = drive(options, given, ros_arguments)
+        record = drive(options, given, period, ros_arguments)
     else:
         from backlash_ros.tools.records.reading import read_record
-        period = options.period or given.get('sample_period')
-        record = read_record(options.record, period if isinstance(period, float) else None, span,
-                             options.axis, options.columns)
+        record = read_record(options.record, period, span, options.axis, options.columns)
     from tqdm import tqdm
 
     from backlash_ros.tools.identify.outcome import identify_record, write_outcome
     with tqdm(file=sys.stderr, disable=None, leave=False, bar_format='{desc}: {elapsed}') as bar:
         found = identify_record(record, options, bar.set_description_str)
-    return write_outcome(found, record, given, options)
+    return DONE if write_outcome(found, record, given, options) else FAILED
+
+
+main = partial(run_tool, 'identify', _identify)

@@ -8,16 +8,12 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import TextIO
 
 from backlash_ros import topics
-from backlash_ros.core.identification.identification import Identification
 from backlash_ros.core.parameters import Parameters, Value
 from backlash_ros.core.records.record import Record, RecordError
 from backlash_ros.middleware import ROS_MISSING, ros_is_missing
@@ -29,9 +25,10 @@ from backlash_ros.tools.records.messages import FEWEST_MESSAGES, from_messages
 
 
 def drive(
-    options: argparse.Namespace, given: Mapping[str, Value], ros_arguments: Sequence[str],
+    options: argparse.Namespace, given: Mapping[str, Value], period: float | None,
+    ros_arguments: Sequence[str],
 ) -> Record:
-    """Move the actuator and return the record.
+    """Move the actuator and return the record; period [s]: None tells it from the stamps.
 
     Raises InputError where it was refused, BrokenOffError where it was interrupted, where nothing
     came, or without ROS 2.
@@ -41,7 +38,6 @@ def drive(
     with tempfile.TemporaryDirectory() as folder, StopRequests() as stop:
         path, config = Path(folder) / 'messages.csv', Path(folder) / 'parameters.yaml'
         path.touch()
-        period = given.get('sample_period')
         write_config(Parameters(dict(given)), config)
         command = [sys.executable, '-m', 'backlash_ros.nodes.check_driver', '--drive',
                    '--messages', str(path), '--config', str(config)]
@@ -50,16 +46,14 @@ def drive(
             if value is not None:
                 values = value if isinstance(value, list) else [value]
                 command += [f'--{name.replace("_", "-")}', *map(str, values)]
-        with path.open(encoding='ascii') as file:
-            records = _records(file, period if isinstance(period, float) else None)
-            # A group of its own: a Ctrl-C reaches this process alone, which passes it on.
-            child = subprocess.Popen([*command, *ros_arguments], start_new_session=True,
-                                     stdout=sys.stderr)
-            try:
-                _follow(child, records, options, stop)
-            finally:
-                _end(child, stop)
-            record = next(records)
+        # A group of its own: a Ctrl-C reaches this process alone, which passes it on.
+        child = subprocess.Popen([*command, *ros_arguments], start_new_session=True,
+                                 stdout=sys.stderr)
+        try:
+            _follow(child, path, period, options, stop)
+        finally:
+            _end(child, stop)
+        record = _record(path, period)
         if child.returncode == BAD_INPUT:
             raise InputError('the actuator was not moved, see above')
         if stop.count:
@@ -69,59 +63,57 @@ def drive(
         return record
 
 
-def _records(file: TextIO, period: float | None) -> Iterator[Record | None]:
-    """The record of what the node has written so far, None while it is none yet, each time anew.
+def _record(path: Path, period: float | None) -> Record | None:
+    """The record of what the node has written so far, None while it is none yet.
 
     On each line of the file: topic, stamp [ns], value.
     """
-    unfinished, heard = '', dict[str, list[tuple[int, float]]]()
-    while True:
-        *lines, unfinished = (unfinished + file.read()).split('\n')
-        for line in lines:
-            topic, stamp, value = line.split(',')
-            heard.setdefault(topic, []).append((int(stamp), float(value)))
-        record = None
+    heard: dict[str, list[tuple[int, float]]] = {}
+    *lines, _ = path.read_text(encoding='ascii').split('\n')  # the last one is yet to be ended
+    for line in lines:
+        topic, stamp, value = line.split(',')
+        heard.setdefault(topic, []).append((int(stamp), float(value)))
+    with suppress(RecordError):
         if len(heard.get(topics.PLANT_OUTPUT, ())) >= FEWEST_MESSAGES:
-            with suppress(RecordError):
-                record = replace(from_messages(heard, period), source='the motion')
-        yield record
+            return replace(from_messages(heard, period), source='the motion')
+    return None
 
 
 def _follow(
-    child: subprocess.Popen[bytes], records: Iterator[Record | None], options: argparse.Namespace,
+    child: subprocess.Popen[bytes], path: Path, period: float | None, options: argparse.Namespace,
     stop: StopRequests,
 ) -> None:
     """Tell now and then what the record says, until the motion ends, is precise enough, or is to
     be stopped. It is identified beside the motion, by a thread that gives way to the driver."""
-    next_look = 3.0  # [s] of motion before an estimate
-    given_up = threading.Event()
+    enough = threading.Event()
 
     def go_on(_: str) -> None:
-        if given_up.is_set():
+        if enough.is_set():
             raise BrokenOffError('nobody asks for the estimate any more')
 
-    estimate: Future[Identification] | None = None
-    beside = ThreadPoolExecutor(1, initializer=partial(os.nice, 5))
-    while child.poll() is None and not stop.count:
-        time.sleep(0.25)
-        record = next(records)
-        moved = len(record.v) * record.sample_period if record else 0.0
-        if record and estimate is None and moved >= next_look:
-            estimate = beside.submit(
-                identify_record, replace(record, commands=None), options, go_on)
-        if estimate is None or not estimate.done():
-            continue
-        finished, estimate, next_look = estimate, None, 1.5 * next_look
-        with suppress(BrokenOffError):
-            found = finished.result()
-            said = found.verdict.lines[0] if found.verdict else found.refused
-            print(f'{moved:5.1f} s  {said}', file=sys.stderr, flush=True)
-            if found.usable and max(found.std['gap'], found.gap * float(
-                    found.model.response_std.max())) <= options.precision * found.gap:
-                break
-    # Without waiting for it: the node is to come to rest now.
-    given_up.set()
-    beside.shutdown(wait=False)
+    def look() -> None:
+        os.nice(5)
+        next_look = 3.0  # [s] of motion before an estimate
+        while not enough.wait(0.25):
+            # The file is gone as well once nobody asks any more.
+            with suppress(BrokenOffError, FileNotFoundError):
+                record = _record(path, period)
+                moved = len(record.v) * record.sample_period if record else 0.0
+                if record is None or moved < next_look:
+                    continue
+                next_look *= 1.5
+                found = identify_record(replace(record, commands=None), options, go_on)
+                said = found.verdict.lines[0] if found.verdict else found.refused
+                print(f'{moved:5.1f} s  {said}', file=sys.stderr, flush=True)
+                if found.usable and max(found.std['gap'], found.gap * float(
+                        found.model.response_std.max())) <= options.precision * found.gap:
+                    enough.set()
+
+    threading.Thread(target=look, daemon=True).start()
+    while child.poll() is None and not (stop.count or enough.is_set()):
+        time.sleep(0.05)
+    # Without waiting for the thread: the node is to come to rest now.
+    enough.set()
 
 
 def _end(child: subprocess.Popen[bytes], stop: StopRequests) -> None:

@@ -21,11 +21,28 @@ from backlash_ros.core.parameters import BRINGUP, BY_NAME, PLANT, ParameterError
 from backlash_ros.core.records.record import Record
 from backlash_ros.tools.cli import BrokenOffError, format_table
 from backlash_ros.tools.config import ANY, config_text
-from backlash_ros.tools.page import table, write_page
+from backlash_ros.tools.page import Picture, table, write_page
 from backlash_ros.tools.records.columns import COMMAND, ROLES
 from backlash_ros.tools.runs.files import result_directory, write_summary, write_table
 
 YAML = 'identified.yaml'
+# By them a person judges whether the result is to be trusted: file, heading, what to see in it.
+PICTURES = (
+    ('held_out.png', 'Measured and simulated y on samples that were held out',
+     'Simulated from v alone, with a model that was fitted to the samples before: the lines '
+     'should lie on each other, and the difference should look like noise.'),
+    ('loop.png', 'The backlash',
+     'Left: y over v as measured. Right: what the backlash that was found takes from v, over '
+     'v: c<sub>r</sub> while v pushes to the right, c<sub>l</sub> to the left, and in between '
+     'while v crosses the gap after each turn.'),
+    ('residual.png', 'Residual of the fit',
+     'y minus the simulation of the whole record. Its autocorrelation should stay within the '
+     'band of white noise; the rounding of an encoder may leave it. Over v it should show no '
+     'shape: a slope or a hook is a nonlinearity that is not in the model.'),
+    ('bode.png', 'Frequency response of m G',
+     'How much and how late y answers to u, with a band of two standard deviations. Between '
+     'the dotted lines y moved; outside of them the record says little.'),
+)
 
 
 def identify_record(
@@ -62,7 +79,7 @@ def write_outcome(
     write_record(replace(record, v=found.v), out / 'record.csv')
     # A Ctrl-C waits while Matplotlib is loaded, which would take it for a part that is missing.
     signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT,))
-    from backlash_ros.tools.identify.pictures import pictures
+    from backlash_ros.tools import figures
     signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT,))
     known = found.verdict is not None and found.verdict.backlash.known
     lines = found.verdict.lines if found.verdict else ()
@@ -71,12 +88,17 @@ def write_outcome(
     constants = [(name, f'{getattr(found, name):.6g}', f'{found.std[name]:.2g}')
                  for name in ('gap', 'c_r', 'c_l', 'm') if found.std]
     head, told = ('', 'found', '±'), _facts(found, record)
+    pictures = [] if found.details is None else [
+        Picture(name, heading, caption, figures.png(draw(found, found.details)))
+        for (name, heading, caption), draw in zip(PICTURES, (
+            figures.draw_held_out, figures.draw_loop, figures.draw_residual, figures.draw_bode,
+        ), strict=True)]
     write_page(
         out / 'identify.html', 'Identification of backlash and G(z)',
         f'<b>The backlash is {"" if known else "not "}known</b>: {len(found.y)} samples of '
         f'{found.sample_period:g} s from {escape(record.source)}.', [*lines, *refused, *notes],
         [table(head, constants) + table((), [(name, escape(fact)) for name, fact in told])]
-        if constants else [], list(pictures(found)), None if text is None else (YAML, text))
+        if constants else [], pictures, None if text is None else (YAML, text))
     print('\n'.join([
         *lines, *([format_table(head, constants)] if constants else []),
         *(f'{name}: {fact}' for name, fact in told), *(f'note: {note}' for note in notes), *refused,
