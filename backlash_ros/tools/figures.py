@@ -102,13 +102,14 @@ def limits(values: Sequence[Array], margin: float) -> tuple[float, float]:
 
 
 def draw_panels(
-    figure: Figure, rows: Mapping[str, Sequence[Line]], parts: Sequence[Part] = (WHOLE_RUN,),
-    frozen_in: RunRecord | None = None, **others: Any,
-) -> NDArray[Any]:
-    """Let the columns of a figure show parts of a run; returns the axes, shape (rows, parts).
+    height: float, rows: Mapping[str, Sequence[Line]], parts: Sequence[Part] = (WHOLE_RUN,),
+    frozen_in: RunRecord | None = None, laid_out: bool = True, **others: Any,
+) -> tuple[Figure, NDArray[Any]]:
+    """A figure whose columns show parts of a run, and its axes, shape (rows, parts).
 
     rows: lines by what stands at the vertical axis. frozen_in: shades its times without learning.
     """
+    figure = new_figure(height, laid_out)
     grid = np.asarray(figure.subplots(len(rows), len(parts), sharex='col', squeeze=False, **others))
     for column, part in zip(grid.T, parts, strict=True):
         label(column[0], part.name)
@@ -121,14 +122,14 @@ def draw_panels(
             if frozen_in is not None:
                 frozen = frozen_in.column('status')[part.rows] >= float(Status.NOT_EXCITED)
                 shade(axes, frozen_in.column('t')[part.rows], frozen, 'frozen')
-    return grid
+    return figure, grid
 
 
 def draw_parameter_errors(
     run: RunRecord, start: Part, settling: Mapping[str, float | None],
 ) -> Figure:
     """Errors of the estimates over time, as Figure 4 of the paper, and their relative size."""
-    t, tolerance, figure = run.column('t'), 100.0 * SETTLING_TOLERANCE, new_figure(7.4)
+    t, tolerance = run.column('t'), 100.0 * SETTLING_TOLERANCE
     errors: list[Line] = []
     percents: list[Line] = []
     for name in BACKLASH:
@@ -138,7 +139,7 @@ def draw_parameter_errors(
         # Nothing is a percentage of zero, and the logarithm has no zero.
         size = np.maximum(100.0 * np.abs(error / np.where(truth == 0.0, np.nan, truth)), 1e-6)
         percents.append((t, size, hue, '', style, 1.5))
-    grid = draw_panels(figure, {
+    figure, grid = draw_panels(7.4, {
         'true minus estimated': errors, 'size of the error [% of the true value]': percents,
     }, (start, WHOLE_RUN), run, sharey='row')
     for absolute, relative in grid.T:
@@ -164,12 +165,11 @@ def draw_estimates(run: RunRecord, recorded: RunRecord | None = None) -> Figure:
     if recorded is not None:
         names |= {'innovation [y]': 'innovation', 'status': 'status'}
         beside, prefix, wide, own = recorded, '', 'run', 'replay'
-    figure = new_figure(1.0 + 2.0 * len(names))
-    rows = draw_panels(figure, {text: [
+    figure, grid = draw_panels(1.0 + 2.0 * len(names), {text: [
         (t, beside.column(f'{prefix}{name}'), HUES['true'], wide, '-', 6.0, 0.22),
         (t, run.column(name), HUES.get(name, HUES['e']), own, '-', 1.8),
-    ] for text, name in names.items()}, frozen_in=run)[:, 0]
-    for axes, name in zip(rows, BACKLASH, strict=False):
+    ] for text, name in names.items()}, frozen_in=run)
+    for axes, name in zip(grid[:, 0], BACKLASH, strict=False):
         estimate, std = run.column(name), 2 * run.column(f'std_{name}')
         band(axes, t, estimate - std, estimate + std, HUES[name], '±2 standard deviations')
         # The first, nearly boundless uncertainty would flatten everything else: the limits are
@@ -178,15 +178,14 @@ def draw_estimates(run: RunRecord, recorded: RunRecord | None = None) -> Figure:
         label(axes, f'${HATS[name]}$ = {estimate[-1]:.6g} ± {number(std[-1], 2)} at the end')
         legend_above(axes)
     if recorded is not None:
-        rows[-1].set_yticks([int(state) for state in Status], [state.word for state in Status])
+        grid[-1, 0].set_yticks([int(state) for state in Status], [state.word for state in Status])
     return figure
 
 
 def draw_closer(run: RunRecord, values: Array, name: str, parts: Sequence[Part]) -> Figure:
     """A signal over the whole run, and beside it closer over each part."""
-    figure, lines = new_figure(3.6), [(run.column('t'), values, HUES['e'])]
-    draw_panels(figure, {name: lines}, (WHOLE_RUN, *parts), run)
-    return figure
+    lines = [(run.column('t'), values, HUES['e'])]
+    return draw_panels(3.6, {name: lines}, (WHOLE_RUN, *parts), run)[0]
 
 
 def draw_hysteresis(run: RunRecord, end: Part) -> Figure:
@@ -220,8 +219,8 @@ def draw_output(run: RunRecord, end: Part, delay: int, followed: bool) -> Figure
     """Reference, `delay` samples late, and output: on one scale where y follows, else on two."""
     t, y, y_m = run.column('t'), run.column('y'), delayed_reference(run, delay)
     late = f', {delay * run.sample_period:.4g} s late' if delay else ''
-    reference, output, figure = (t, y_m, HUES['y_m']), (t, y, HUES['y']), new_figure(5.6)
-    grid = draw_panels(figure, {
+    reference, output = (t, y_m, HUES['y_m']), (t, y, HUES['y'])
+    figure, grid = draw_panels(5.6, {
         '[unit of y]': [(*reference, f'$y_m${late}', '--'), (*output, 'y')],
         'y minus reference [unit of y]': [(t, y - y_m, HUES['y'])],
     } if followed else {
@@ -233,8 +232,8 @@ def draw_output(run: RunRecord, end: Part, delay: int, followed: bool) -> Figure
 
 
 def draw_input(run: RunRecord, parts: Sequence[Part]) -> Figure:
-    t, figure = run.column('t'), new_figure(5.6)
-    grid = draw_panels(figure, {
+    t = run.column('t')
+    figure, grid = draw_panels(5.6, {
         'input of G [unit of u]': [(t, run.column('u'), HUES['u'], 'u', '-', 1.6),
                                    (t, run.column('u_d'), HUES['u_d'], '$u_d$', '--', 1.6)],
         'control v [unit of v]': [(t, run.column('v'), HUES['v'])],
@@ -255,8 +254,7 @@ def draw_error_curves(loops: Sequence[ErrorCurves]) -> Figure:
             if error is not None:
                 row = f'RMS of ${what}$ over {ERROR_WINDOW_S} s\n[unit of {unit}]'
                 rows.setdefault(row, []).append((t, error, *look))
-    figure = new_figure(4.2 * len(rows))
-    grid = draw_panels(figure, rows)
+    figure, grid = draw_panels(4.2 * len(rows), rows)
     titles = 'Control error', 'Tracking error, where y is meant to follow'
     for axes, lines, title in zip(grid[:, 0], rows.values(), titles, strict=False):
         label(axes, title)
@@ -282,12 +280,13 @@ def draw_log(run: RunRecord) -> Figure:
 def draw_held_out(found: Identification, details: Details) -> Figure:
     """Measured and simulated y on samples that were held out, and the difference."""
     first, y, simulated, rms, _ = details.held_out
-    t, figure = _times(found, first, simulated), new_figure(6.2, laid_out=False)
-    upper, lower = draw_panels(figure, {
+    t = _times(found, first, simulated)
+    figure, grid = draw_panels(6.2, {
         'y': [(t, y, HUES['y'], 'measured', '-', 2.2),
               (t, simulated, HUES['u_d'], 'simulated', '--')],
         'difference': [(t, y - simulated, HUES['e'])],
-    }, height_ratios=[2.2, 1.0])[:, 0]
+    }, laid_out=False, height_ratios=[2.2, 1.0])
+    upper, lower = grid[:, 0]
     label(upper, f'{1.0 - rms / max(float(np.nanstd(y)), 1e-300):.2%} of the motion is predicted')
     legend_above(upper)
     zero_line(lower)
@@ -336,15 +335,16 @@ def draw_residual(found: Identification, details: Details) -> Figure:
 
 def draw_bode(found: Identification, details: Details) -> Figure:
     """Frequency response of m G with two standard deviations; dotted: where y moved."""
-    figure = new_figure(5.6, laid_out=False)
     w = np.geomspace(max(found.model.frequencies[0] / 5.0, 1e-5), 0.98 * np.pi, 400)
     f = w / (2.0 * np.pi * found.sample_period)
     value = details.response.at(w) * np.exp(-1j * w * found.model.delay)
     spread = 2.0 * details.response.std(w)
     size, angle = np.abs(value), np.degrees(np.unwrap(np.angle(value)))
     turn = np.degrees(np.arcsin(np.minimum(spread, 1.0)))
-    magnitude, phase = draw_panels(figure, {
-        '|m G| [y/v]': [(f, size, HUES['m'])], 'degrees': [(f, angle, HUES['m'])]})[:, 0]
+    figure, grid = draw_panels(5.6, {
+        '|m G| [y/v]': [(f, size, HUES['m'])], 'degrees': [(f, angle, HUES['m'])],
+    }, laid_out=False)
+    magnitude, phase = grid[:, 0]
     band(magnitude, f, size * np.maximum(1.0 - spread, 1e-3), size * (1.0 + spread), HUES['m'])
     band(phase, f, angle - turn, angle + turn, HUES['m'])
     for edge in found.hertz[[0, -1]]:

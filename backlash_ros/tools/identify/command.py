@@ -40,7 +40,7 @@ def make_parser() -> argparse.ArgumentParser:
     drive.add_argument('--drive', action='store_true',
                        help='move the actuator within control.min, control.max and '
                             'control.rate_max of --config, record, bring it to rest, identify')
-    drive.add_argument('--precision', type=_share, default=0.0, metavar='P%',
+    drive.add_argument('--precision', type=share, default=0.0, metavar='P%',
                        help='end the motion as soon as gap and G are known to this (default: 0, '
                             'the whole duration)')
     add_motion_options(drive, 20.0, 'longest motion')
@@ -56,11 +56,9 @@ def _numbers(text: str, most: int) -> tuple[int, ...]:
     return tuple(range(int(first), int(last or first) + 1))
 
 
-def _share(text: str) -> float:
-    try:
-        number = float(text.removesuffix('%')) / (100.0 if text.endswith('%') else 1.0)
-    except ValueError:
-        number = -1.0
+def share(text: str) -> float:
+    """An option like 1% or 0.01; argparse reports what is none."""
+    number = float(text.removesuffix('%')) / (100.0 if text.endswith('%') else 1.0)
     if not 0.0 <= number < 1.0:
         raise argparse.ArgumentTypeError(f'{text!r} must be like 1% or 0.01')
     return number

@@ -46,13 +46,19 @@ def drive(
             if value is not None:
                 values = value if isinstance(value, list) else [value]
                 command += [f'--{name.replace("_", "-")}', *map(str, values)]
-        # A group of its own: a Ctrl-C reaches this process alone, which passes it on.
+        enough, sent = threading.Event(), 0
+        threading.Thread(target=_look, args=(path, period, options, enough), daemon=True).start()
+        # A group of its own: a Ctrl-C reaches this process alone, which passes it on. With the
+        # first one, or when enough is known, the node comes to rest; with a further one it holds v.
         child = subprocess.Popen([*command, *ros_arguments], start_new_session=True,
                                  stdout=sys.stderr)
-        try:
-            _follow(child, path, period, options, stop)
-        finally:
-            _end(child, stop)
+        while child.poll() is None:
+            if max(stop.count, enough.is_set()) > sent:
+                child.send_signal(signal.SIGINT)
+                enough.set()
+                sent += 1
+            time.sleep(0.05)
+        enough.set()
         record = _record(path, period)
         if child.returncode == BAD_INPUT:
             raise InputError('the actuator was not moved, see above')
@@ -79,50 +85,30 @@ def _record(path: Path, period: float | None) -> Record | None:
     return None
 
 
-def _follow(
-    child: subprocess.Popen[bytes], path: Path, period: float | None, options: argparse.Namespace,
-    stop: StopRequests,
+def _look(
+    path: Path, period: float | None, options: argparse.Namespace, enough: threading.Event,
 ) -> None:
-    """Tell now and then what the record says, until the motion ends, is precise enough, or is to
-    be stopped. It is identified beside the motion, by a thread that gives way to the driver."""
-    enough = threading.Event()
+    """Tell now and then what the record says, until enough is known, which may be told here.
 
+    It is identified beside the motion, by a thread that gives way to the driver.
+    """
     def go_on(_: str) -> None:
         if enough.is_set():
             raise BrokenOffError('nobody asks for the estimate any more')
 
-    def look() -> None:
-        os.nice(5)
-        next_look = 3.0  # [s] of motion before an estimate
-        while not enough.wait(0.25):
-            # The file is gone as well once nobody asks any more.
-            with suppress(BrokenOffError, FileNotFoundError):
-                record = _record(path, period)
-                moved = len(record.v) * record.sample_period if record else 0.0
-                if record is None or moved < next_look:
-                    continue
-                next_look *= 1.5
-                found = identify_record(replace(record, commands=None), options, go_on)
-                said = found.verdict.lines[0] if found.verdict else found.refused
-                print(f'{moved:5.1f} s  {said}', file=sys.stderr, flush=True)
-                if found.usable and max(found.std['gap'], found.gap * float(
-                        found.model.response_std.max())) <= options.precision * found.gap:
-                    enough.set()
-
-    threading.Thread(target=look, daemon=True).start()
-    while child.poll() is None and not (stop.count or enough.is_set()):
-        time.sleep(0.05)
-    # Without waiting for the thread: the node is to come to rest now.
-    enough.set()
-
-
-def _end(child: subprocess.Popen[bytes], stop: StopRequests) -> None:
-    """Let the node come to rest; every further signal is passed on: it then holds v."""
-    if child.poll() is None:
-        child.send_signal(signal.SIGINT)
-    passed = stop.count
-    while child.poll() is None:
-        time.sleep(0.05)
-        if stop.count > max(passed, 1):
-            passed = stop.count
-            child.send_signal(signal.SIGINT)
+    os.nice(5)
+    next_look = 3.0  # [s] of motion before an estimate
+    while not enough.wait(0.25):
+        # The file is gone as well once nobody asks any more.
+        with suppress(BrokenOffError, FileNotFoundError):
+            record = _record(path, period)
+            moved = len(record.v) * record.sample_period if record else 0.0
+            if record is None or moved < next_look:
+                continue
+            next_look *= 1.5
+            found = identify_record(replace(record, commands=None), options, go_on)
+            said = found.verdict.lines[0] if found.verdict else found.refused
+            print(f'{moved:5.1f} s  {said}', file=sys.stderr, flush=True)
+            if found.usable and max(found.std['gap'], found.gap * float(
+                    found.model.response_std.max())) <= options.precision * found.gap:
+                enough.set()

@@ -2,7 +2,7 @@
 
 import argparse
 import signal
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from html import escape
 from pathlib import Path
@@ -26,23 +26,6 @@ from backlash_ros.tools.records.columns import COMMAND, ROLES
 from backlash_ros.tools.runs.files import result_directory, write_summary, write_table
 
 YAML = 'identified.yaml'
-# By them a person judges whether the result is to be trusted: file, heading, what to see in it.
-PICTURES = (
-    ('held_out.png', 'Measured and simulated y on samples that were held out',
-     'Simulated from v alone, with a model that was fitted to the samples before: the lines '
-     'should lie on each other, and the difference should look like noise.'),
-    ('loop.png', 'The backlash',
-     'Left: y over v as measured. Right: what the backlash that was found takes from v, over '
-     'v: c<sub>r</sub> while v pushes to the right, c<sub>l</sub> to the left, and in between '
-     'while v crosses the gap after each turn.'),
-    ('residual.png', 'Residual of the fit',
-     'y minus the simulation of the whole record. Its autocorrelation should stay within the '
-     'band of white noise; the rounding of an encoder may leave it. Over v it should show no '
-     'shape: a slope or a hook is a nonlinearity that is not in the model.'),
-    ('bode.png', 'Frequency response of m G',
-     'How much and how late y answers to u, with a band of two standard deviations. Between '
-     'the dotted lines y moved; outside of them the record says little.'),
-)
 
 
 def identify_record(
@@ -77,10 +60,6 @@ def write_outcome(
     write_summary({**numbers(found), 'timing': record.timing, 'notes': record.notes},
                   out / 'identified.json')
     write_record(replace(record, v=found.v), out / 'record.csv')
-    # A Ctrl-C waits while Matplotlib is loaded, which would take it for a part that is missing.
-    signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT,))
-    from backlash_ros.tools import figures
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT,))
     known = found.verdict is not None and found.verdict.backlash.known
     lines = found.verdict.lines if found.verdict else ()
     refused = [f'no {YAML}: {found.refused}'] if found.refused else []
@@ -88,22 +67,46 @@ def write_outcome(
     constants = [(name, f'{getattr(found, name):.6g}', f'{found.std[name]:.2g}')
                  for name in ('gap', 'c_r', 'c_l', 'm') if found.std]
     head, told = ('', 'found', '±'), _facts(found, record)
-    pictures = [] if found.details is None else [
-        Picture(name, heading, caption, figures.png(draw(found, found.details)))
-        for (name, heading, caption), draw in zip(PICTURES, (
-            figures.draw_held_out, figures.draw_loop, figures.draw_residual, figures.draw_bode,
-        ), strict=True)]
     write_page(
         out / 'identify.html', 'Identification of backlash and G(z)',
         f'<b>The backlash is {"" if known else "not "}known</b>: {len(found.y)} samples of '
         f'{found.sample_period:g} s from {escape(record.source)}.', [*lines, *refused, *notes],
         [table(head, constants) + table((), [(name, escape(fact)) for name, fact in told])]
-        if constants else [], pictures, None if text is None else (YAML, text))
+        if constants else [], list(_pictures(found)), None if text is None else (YAML, text))
     print('\n'.join([
         *lines, *([format_table(head, constants)] if constants else []),
         *(f'{name}: {fact}' for name, fact in told), *(f'note: {note}' for note in notes), *refused,
         str(out / (YAML if found.usable else 'identified.json')), str(out / 'identify.html')]))
     return known
+
+
+def _pictures(found: Identification) -> Iterator[Picture]:
+    """By them a person judges whether the result is to be trusted; none where nothing was fitted.
+    """
+    # A Ctrl-C waits while Matplotlib is loaded, which would take it for a part that is missing.
+    signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT,))
+    from backlash_ros.tools import figures
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT,))
+    for name, heading, caption, draw in (
+        ('held_out.png', 'Measured and simulated y on samples that were held out',
+         'Simulated from v alone, with a model that was fitted to the samples before: the lines '
+         'should lie on each other, and the difference should look like noise.',
+         figures.draw_held_out),
+        ('loop.png', 'The backlash',
+         'Left: y over v as measured. Right: what the backlash that was found takes from v, over '
+         'v: c<sub>r</sub> while v pushes to the right, c<sub>l</sub> to the left, and in between '
+         'while v crosses the gap after each turn.', figures.draw_loop),
+        ('residual.png', 'Residual of the fit',
+         'y minus the simulation of the whole record. Its autocorrelation should stay within the '
+         'band of white noise; the rounding of an encoder may leave it. Over v it should show no '
+         'shape: a slope or a hook is a nonlinearity that is not in the model.',
+         figures.draw_residual),
+        ('bode.png', 'Frequency response of m G',
+         'How much and how late y answers to u, with a band of two standard deviations. Between '
+         'the dotted lines y moved; outside of them the record says little.', figures.draw_bode),
+    ):
+        if found.details is not None:
+            yield Picture(name, heading, caption, figures.png(draw(found, found.details)))
 
 
 def write_record(record: Record, path: Path) -> None:
@@ -144,17 +147,22 @@ def identified_parameters(
     estimates: file of what the controller is to begin with. Raises ParameterError where the
     controller does not take it.
     """
-    # Parameters of the file that the user gave which do not go on: of the simulation, of one run.
+    # Parameters of the file that the user gave which do not go on: of the simulation, of one run,
+    # and of an actuator, which is outdated where v is the command.
     not_taken_over = (
         'truth', 'backlash', 'output_noise_std', 'output_quantum', 'input_disturbance', 'estimates',
-        'bag', 'lockstep', 'wait_for_subscribers', 'wait_for_publishers', 'axes')
+        'bag', 'lockstep', 'wait_for_subscribers', 'wait_for_publishers', 'axes', 'actuator')
     wider = 3.0  # bounds of the estimates, in times of what was found
     assert found.details is not None
     reach = max(abs(found.c_r), abs(found.c_l)) + found.std['c_r']
     scale = _short(max(wider * max(found.gap, reach), 1e-9))
     c_r, c_l, g = _short(found.c_r, 6), _short(found.c_l, 6), found.model
-    lag = found.actuator and found.actuator.lag
-    right, left = found.actuator.wind_up if found.actuator else (0.0, 0.0)
+    actuator: dict[str, Any] = {}
+    if found.actuator is not None:
+        (right, left), lag = found.actuator.wind_up, found.actuator.lag
+        actuator = {'actuator.numerator': tuple(lag.numerator.tolist()),
+                    'actuator.denominator': tuple(lag.denominator.tolist()),
+                    'actuator.wind_up': (_short(right, 6), _short(left, 6))}
     # Digits that the swing bears, wherever 0 of v is.
     digits = 3 - int(np.floor(np.log10(np.ptp(found.v))))
     values: dict[str, Any] = {
@@ -163,17 +171,14 @@ def identified_parameters(
         'control.max': round(float(found.v.max()), digits),
         'control.rate_max': _short(np.abs(np.diff(found.v)).max() / found.sample_period, 4),
         **_weights(found, found.details),
-        **({'estimator.use_applied_control': 'true'} if lag else {}),
+        **({'estimator.use_applied_control': 'true'} if actuator else {}),
         **(_reference(found, found.details)
            if not {'waveform', 'amplitude', 'frequency', 'bias', 'file'} & set(given) else {}),
         **{name: value for name, value in given.items() if not name.startswith(not_taken_over)},
         'sample_period': found.sample_period,
         'plant.numerator': g.numerator, 'plant.denominator': g.denominator,
         'plant.uncertainty': g.uncertainty, 'control.delay_samples': g.delay,
-        # None where v is the command: whatever the given file has of it is outdated.
-        'actuator.numerator': tuple(lag.numerator.tolist()) if lag else (),
-        'actuator.denominator': tuple(lag.denominator.tolist()) if lag else (),
-        'actuator.wind_up': (_short(right, 6), _short(left, 6)),
+        **actuator,
         'estimator.initial.m': found.m,
         'estimator.initial.c_r': c_r, 'estimator.initial.c_l': c_l,
         'estimator.bounds.m': (_short(found.m / wider), _short(found.m * wider)),
