@@ -16,11 +16,12 @@ import numpy as np
 import yaml
 from tqdm import tqdm
 
-from backlash_ros.core.parameters import BY_NAME, Parameters, Value, check_names, check_value
+from backlash_ros.core.parameters import Parameters, Value
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.run_record import SETTLING_TOLERANCE
 from backlash_ros.tools import cli
 from backlash_ros.tools.cli import BrokenOffError, InputError
+from backlash_ros.tools.config import parse_setting
 from backlash_ros.tools.runs.read_run import run_loop
 from backlash_ros.tools.runs.summary import summarise
 from backlash_ros.topics import BACKLASH
@@ -56,16 +57,13 @@ def combinations(texts: Sequence[str]) -> list[dict[str, Value]]:
         name, _, listed = map(str.strip, text.partition('='))
         if name in sweeps:
             raise InputError(f'--sweep names {name} twice')
-        check_names([name])
         try:
             values = yaml.safe_load(f'[{listed}]')
         except yaml.YAMLError:
             values = []
         if not values:
             raise InputError(f'--sweep {text!r} must be KEY=v1,v2,... in YAML')
-        of_words = isinstance(BY_NAME[name].default, str)
-        sweeps[name] = [check_value(BY_NAME[name], str(value) if of_words else value)
-                        for value in values]
+        sweeps[name] = [parse_setting(f'{name}={value}')[-1] for value in values]
     return [dict(zip(sweeps, values, strict=True)) for values in product(*sweeps.values())]
 
 

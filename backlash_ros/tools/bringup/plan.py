@@ -48,7 +48,6 @@ class Axis:
     next_line: float = 0.0
     published: Mapping[str, int] | None = None
     heard: Mapping[str, int] = field(default_factory=dict)
-    silent: bool = False
 
     @property
     def logs(self) -> Path:
@@ -81,7 +80,7 @@ class Axis:
         self.heard = {'samples': made, **progress.get('received', {})}
         if made <= self.made:
             return
-        self.made, self.moved, self.silent = made, now, False
+        self.made, self.moved = made, now
         if now >= self.next_line:
             # Every 2 s, and ever more seldom, so that a run of days does not fill the disk.
             self.next_line = now + max(2.0, 0.05 * made * p.sample_period)
@@ -97,16 +96,15 @@ class Axis:
         waits = p.driver == ELSEWHERE or (unready and (not p.autostart or p.joints))
         # A plant of long periods may take its time.
         patience = 10.0 + 2.0 * p.sample_period if self.made else START_DEADLINE_S
-        if self.complete or self.silent or time.monotonic() < self.moved + patience \
-                or (waits and not self.made):
+        if self.complete or (waits and not self.made) or time.monotonic() < self.moved + patience:
             return
         what = f'not ready within {patience:g} s: {", ".join(child.name for child in unready)}' \
             if unready else f'no new sample for {patience:g} s'
         if self.made:
             what += f' after sample {self.first + self.made - 1}'
         if p.driver and self.made:
-            # The controller knows what to do when a real plant falls silent.
-            self.silent = True
+            # The controller knows what to do when a real plant falls silent; said once.
+            self.moved = inf
             complain(self.titled(f'{what}, waiting for the driver'))
             return
         cure = ': does the driver listen to its command and publish its output? Where it needs ' \
@@ -210,7 +208,7 @@ def plan_processes(
             order = ('controller', '', '' if p.joints else 'reference', 'recorder')
         for stage, node in zip(stages, order, strict=True):
             if node:
-                stage.append(_node(axis, node, *_arguments(axis, node, record)))
+                stage.append(_node(axis, node, record))
         if p.driver and p.driver != ELSEWHERE:
             served.setdefault(p.driver, []).append(axis)
     for command, of in served.items():
@@ -220,27 +218,25 @@ def plan_processes(
             name, shlex.split(command), of[0].logs / 'driver.log', foreign=True))
     if live_port is not None:
         shown = [f'/{axis.name}' if axis.name else '/controller' for axis in axes]
-        stages[-1].append(_node(axes[0], 'live', '--port', str(live_port), *shown))
+        stages[-1].append(Child(
+            'live',
+            [sys.executable, '-m', 'backlash_ros.nodes.live', '--port', str(live_port), *shown],
+            axes[0].logs / 'live.log', axes[0], spectator=True))
     return stages
 
 
-def _node(axis: Axis, node: str, *arguments: str) -> Child:
-    of_all = node == 'live'  # the page of all axes
-    return Child(node if of_all else axis.process_name(node),
-                 (sys.executable, '-m', f'backlash_ros.nodes.{node}', *arguments),
-                 axis.logs / f'{node}.log', axis, spectator=of_all)
-
-
-def _arguments(axis: Axis, node: str, record: bool) -> list[str]:
+def _node(axis: Axis, name: str, record: bool) -> Child:
     lockstep = axis.parameters.lockstep
-    if node == 'recorder':
-        # In YAML, whatever stands in the path.
-        bag = str(axis.out / BAG).replace("'", "''") if record else ''
-        settings = ['-p', 'wait_for_publishers:=true', '-p', f"bag:='{bag}'"]
-    else:
-        # The loop and the recorder; in real time the reference follows plant_output as well, in
-        # lockstep it follows /clock.
-        settings = ['-p', f'wait_for_subscribers:={3 if node == "plant" and not lockstep else 2}']
+    # In YAML, whatever stands in the path.
+    bag = str(axis.out / BAG).replace("'", "''") if record else ''
+    # The loop and the recorder; in real time the reference follows plant_output as well, in
+    # lockstep it follows /clock.
+    listeners = 3 if name == 'plant' and not lockstep else 2
+    arguments = ['--params-file', str(axis.out / CONFIG_FILE), '-p', f"bag:='{bag}'",
+                 '-p', 'wait_for_publishers:=true', '-p', f'wait_for_subscribers:={listeners}']
     if axis.name:  # each axis has a time of its own
-        settings += ['-r', f'__ns:=/{axis.name}', *['-r', '/clock:=clock'] * lockstep]
-    return ['--ros-args', '--params-file', str(axis.out / CONFIG_FILE), *settings]
+        arguments += ['-r', f'__ns:=/{axis.name}', *['-r', '/clock:=clock'] * lockstep]
+    return Child(
+        axis.process_name(name),
+        [sys.executable, '-m', f'backlash_ros.nodes.{name}', '--ros-args', *arguments],
+        axis.logs / f'{name}.log', axis)
