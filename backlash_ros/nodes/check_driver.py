@@ -4,12 +4,13 @@ For `identify --drive` it moves v, and writes what it hears and sends instead of
 """
 
 import argparse
+import difflib
 import os
 import re
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from functools import partial
 from math import inf
@@ -18,7 +19,10 @@ from typing import Any
 
 import numpy as np
 from rclpy.duration import Duration
+from rclpy.node import Node
 from rclpy.publisher import Publisher
+from rclpy.qos import QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
@@ -26,8 +30,7 @@ from backlash_ros.core import driver_check
 from backlash_ros.core.assembly import build_controller, build_limits
 from backlash_ros.core.control.limits import plausible
 from backlash_ros.core.control.motion import Drive, drive_limits
-from backlash_ros.core.parameters.table import CONTROLLER
-from backlash_ros.nodes import driver_graph
+from backlash_ros.core.parameters.table import CONTROLLER, RECORDER
 from backlash_ros.nodes.control.rivals import CommandLock
 from backlash_ros.nodes.runtime.executor import PromptExecutor
 from backlash_ros.nodes.runtime.messages import DEPTH, name_of
@@ -80,11 +83,11 @@ class CheckDriverNode(ProcessNode):
         self.exit_code = self._tell()
 
     def _finds_driver(self, executor: PromptExecutor) -> bool:
-        reminder = self.every(3.0, lambda: driver_graph.say_what_is_missing(self))
+        reminder = self.every(3.0, lambda: say_what_is_missing(self))
         deadline, found = time.monotonic() + self._options.wait, False
         while not (found or self.stopping or time.monotonic() > deadline):
             executor.spin_once(timeout_sec=LOOK_S)
-            found = bool(driver_graph.publishers(self, topics.PLANT_OUTPUT))
+            found = bool(publishers(self, topics.PLANT_OUTPUT))
         self.destroy_timer(reminder)
         return found and not self.stopping
 
@@ -110,12 +113,12 @@ class CheckDriverNode(ProcessNode):
 
     def _look(self) -> None:
         """Take note of who is there. Once heard, a rival counts, even if it leaves."""
-        self._graph = max(driver_graph.graph_around(self), self._graph,
+        self._graph = max(graph_around(self), self._graph,
                           key=lambda graph: (graph.publishers, graph.listeners))
         self._file.flush()
         if not self._options.drive:
             return
-        rivals = {name_of(info) for info in driver_graph.publishers(self, topics.CONTROL)}
+        rivals = {name_of(info) for info in publishers(self, topics.CONTROL)}
         now, p = time.monotonic(), self.settings
         if now > self._settled_at:
             if not self._lock.take():
@@ -137,7 +140,7 @@ class CheckDriverNode(ProcessNode):
                 message.data, info['source_timestamp'], info['received_timestamp'],
                 info['publication_sequence_number']))
 
-        self.listen(Float64, topic, on_message, driver_graph.profile(self, topic))
+        self.listen(Float64, topic, on_message, profile(self, topic))
 
     def _note(self, topic: str, message: driver_check.Message) -> None:
         self._heard.by_topic[topic].append(message)
@@ -230,6 +233,74 @@ class CheckDriverNode(ProcessNode):
 
     def _say(self, text: str) -> None:
         print(f'{self.get_name()}: {text}', file=sys.stderr)
+
+
+def publishers(node: Node, topic: str) -> list[TopicEndpointInfo]:
+    """Who else publishes a topic."""
+    return [info for info in node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
+            if info.node_name != node.get_name()]
+
+
+def profile(node: Node, topic: str) -> QoSProfile:
+    """The QoS that hears whoever publishes a topic."""
+    return QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT if
+                      _has_best_effort(publishers(node, topic)) else ReliabilityPolicy.RELIABLE)
+
+
+def graph_around(node: Node) -> driver_check.Graph:
+    """Who is there now and, where nobody listens to v, which topics may have been meant for it."""
+    control = node.resolve_topic_name(topics.CONTROL)
+    outputs = publishers(node, topics.PLANT_OUTPUT)
+    listeners = _others(node, node.get_subscriptions_info_by_topic(control))
+    return driver_check.Graph(
+        len(outputs), tuple(sorted({info.topic_type for info in outputs})), len(listeners),
+        tuple(sorted({_misfit(info.qos_profile) for info in listeners} - {''})),
+        _has_best_effort(outputs), () if listeners else
+        similar_topics(control, _topics(node, node.get_subscriptions_info_by_topic)))
+
+
+def say_what_is_missing(node: Node) -> None:
+    """Say which topic is waited for, and which ones there are."""
+    wanted = node.resolve_topic_name(topics.PLANT_OUTPUT)
+    seen = _topics(node, node.get_publishers_info_by_topic)
+    others = ', '.join(sorted(seen)) or 'no topic'
+    print(f'waiting for {wanted} ({driver_check.FLOAT64}), sees {others}', *(
+        f'  if {near} ({", ".join(seen[near])}) is it: '
+        f'--ros-args -r {topics.PLANT_OUTPUT}:={near}' for near in similar_topics(wanted, seen)
+    ), sep='\n', flush=True)
+
+
+def _topics(
+    node: Node, endpoints: Callable[[str], list[TopicEndpointInfo]],
+) -> dict[str, list[str]]:
+    """Topics that others have such endpoints of, with their types, but for those of ROS."""
+    return {topic: types for topic, types in node.get_topic_names_and_types()
+            if topic not in ('/rosout', '/parameter_events') and _others(node, endpoints(topic))}
+
+
+def _others(node: Node, endpoints: Sequence[TopicEndpointInfo]) -> list[TopicEndpointInfo]:
+    """Without those of this node, of the recorder and of `ros2 topic`."""
+    return [info for info in endpoints if info.node_name not in (node.get_name(), RECORDER)
+            and not info.node_name.startswith('_ros2cli')]
+
+
+def _has_best_effort(endpoints: Sequence[TopicEndpointInfo]) -> bool:
+    return any(info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT for info in endpoints)
+
+
+def _misfit(asked: QoSProfile) -> str:
+    """Why messages cannot pass from control to a subscriber, empty if they can."""
+    # What discovery does not tell (depth) or tells as "infinite" would count as a misfit.
+    bare = QoSProfile(depth=DEPTH, reliability=asked.reliability, durability=asked.durability)
+    compatibility, reason = qos_check_compatible(QoSProfile(depth=DEPTH), bare)
+    return f'control: {reason}' if compatibility == QoSCompatibility.ERROR else ''
+
+
+def similar_topics(wanted: str, seen: Iterable[str]) -> tuple[str, ...]:
+    """Topics that may be the wanted one under another name, by the last part of it."""
+    last = wanted.rpartition('/')[2]
+    return tuple(topic for topic in sorted(seen) if topic != wanted and
+                 difflib.SequenceMatcher(None, last, topic.rpartition('/')[2]).ratio() >= 0.6)
 
 
 def parse_options(plain: Sequence[str]) -> argparse.Namespace:

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from contextlib import suppress
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from itertools import count
 from math import isfinite
 from pathlib import Path
 from threading import Thread
@@ -32,7 +31,7 @@ LIVE_LABELS = tuple(
 class PageServer(ThreadingHTTPServer):
     """Answers each browser in a thread of its own, so that a slow one holds up nobody.
 
-    frames: of the last shown_s [s], each with its number, the state and the new points of curves.
+    frames: of the last shown_s [s], each with its time, the state and the new points of curves.
     """
 
     daemon_threads = True
@@ -41,7 +40,7 @@ class PageServer(ThreadingHTTPServer):
         super().__init__((HOST, port), PageRequest)
         self.address, self.shown_s = f'http://{HOST}:{self.server_address[1]}', shown_s
         kept = round(shown_s / PAGE_PERIOD_S)
-        self.frames: deque[tuple[int, object, object]] = deque(maxlen=kept)
+        self.frames: deque[tuple[float, object, object]] = deque(maxlen=kept)
 
 
 class PageRequest(BaseHTTPRequestHandler):
@@ -67,7 +66,7 @@ class PageRequest(BaseHTTPRequestHandler):
 
     def _send_frames(self) -> None:
         """Send the newest state and all curves, and then what is new, as events of a stream."""
-        sent = -1
+        sent = 0.0
         while True:
             missing = [frame for frame in self.server.frames.copy() if frame[0] > sent]
             if missing:
@@ -98,27 +97,21 @@ class LiveNode(ViewerNode):
             emit('ready', address=self._server.address)
         else:
             print(self._server.address, flush=True)
-        for number in count():
-            executor.spin_once(timeout_sec=0.0)  # the look for further controllers
-            if self.stopping:
-                break
-            self.take_messages()
-            state = {
-                'now': seconds(time.time_ns()), 'shown': self._server.shown_s,
-                'awaited': self.awaited,
-                'controllers': [content_of(each) for _, each in sorted(self.states.items())],
-            }
-            curves = {name: {
-                label: [(seconds(at_ns), rounded(value)) for at_ns, value in points]
-                for label, points in each.watched.items()
-            } for name, each in self.states.items()}
-            self._server.frames.append((number, state, curves))
-            time.sleep(PAGE_PERIOD_S)
+        self.every(PAGE_PERIOD_S, self._add_frame)
+        super().work(executor)
         self._server.shutdown()
 
-
-def seconds(at_ns: int) -> float:
-    return round(1e-9 * at_ns, 6)
+    def _add_frame(self) -> None:
+        self.take_messages()
+        state = {
+            'now': time.time(), 'shown': self._server.shown_s, 'awaited': self.awaited,
+            'controllers': [content_of(each) for _, each in sorted(self.states.items())],
+        }
+        curves = {name: {
+            label: [(round(1e-9 * at_ns, 6), rounded(value)) for at_ns, value in points]
+            for label, points in each.watched.items()
+        } for name, each in self.states.items()}
+        self._server.frames.append((time.monotonic(), state, curves))
 
 
 def rounded(value: float) -> float | None:

@@ -66,8 +66,7 @@ class MonitorNode(ViewerNode):
 
     def _show(self, executor: PromptExecutor, console: Console) -> None:
         with pressed_keys() as keys, Live(
-            console=console, screen=True, auto_refresh=False, redirect_stdout=False,
-            redirect_stderr=False,
+            console=console, screen=True, auto_refresh=False,
         ) as live:
             while not self.stopping:
                 self.take_messages()

@@ -38,10 +38,6 @@ class RecordedTopic:
     newest: bytes = b''  # serialised
     received: int = 0
 
-    @property
-    def name(self) -> str:
-        return str(self.subscription.topic_name)
-
     def row(self, labels: Sequence[str]) -> dict[str, float]:
         """The newest message of an array topic by label, without more than the first joint."""
         data = deserialize_message(self.newest, Float64MultiArray).data if self.newest else ()
@@ -111,7 +107,8 @@ class RecorderNode(ProcessNode):
                 )
         if self.failure:
             self.log.warning(f'{self._unrecorded} messages came after the recording had stopped')
-        emit('closed', messages={each.name: each.received for each in self._channels.values()})
+        channels = self._channels.values()
+        emit('closed', messages={each.subscription.topic_name: each.received for each in channels})
 
     @property
     def _heard(self) -> dict[str, int]:
@@ -122,8 +119,8 @@ class RecorderNode(ProcessNode):
         bag = Bag(path, storage)
         if not bag.survives_a_crash:
             self.log.warning(
-                'the installed version of rosbags cannot be flushed: a crash of the recorder or a '
-                'power cut loses everything. Install the version that requirements/run.txt names'
+                'a crash of the recorder or a power cut loses everything with this version of '
+                'rosbags: install the one that requirements/run.txt names'
             )
         diagnostics = messages.DiagnosticsPublisher(self, path)
         well = Finding(Level.OK, 'recording', f'recording to {path}')

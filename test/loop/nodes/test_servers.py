@@ -31,21 +31,21 @@ def served() -> Iterator[PageServer]:
 
 def test_a_reader_that_takes_nothing_holds_up_nobody(served):
     # More than the kernel takes on the way.
-    served.frames.append((0, {'x': 'x' * 20_000_000}, {}))
+    served.frames.append((1, {'x': 'x' * 20_000_000}, {}))
     with socket.create_connection(served.server_address[:2]) as slow:
         slow.sendall(f'GET /frames HTTP/1.1\r\nHost: {HOST}\r\n\r\n'.encode())
         slow.recv(1, socket.MSG_PEEK)
-        for number in range(1, 20):
+        for number in range(2, 20):
             served.frames.append((number, {'number': number}, {}))
             assert next(frames(served.address))['state'] == {'number': number}
 
 
 def test_a_reader_gets_the_newest_points_and_each_of_them_once(served):
     for k in range(5):
-        served.frames.append((k, {}, {'c': {'m': [float(k)]}}))
+        served.frames.append((k + 1, {}, {'c': {'m': [float(k)]}}))
     seen = frames(served.address)
     assert [curves['c']['m'] for curves in next(seen)['curves']] == [[2.0], [3.0], [4.0]]
-    served.frames.append((5, {}, {'c': {'m': [5.0]}}))
+    served.frames.append((6, {}, {'c': {'m': [5.0]}}))
     assert [curves['c']['m'] for curves in next(seen)['curves']] == [[5.0]]
     assert len(next(frames(served.address))['curves']) == 3
 

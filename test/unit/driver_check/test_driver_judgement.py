@@ -17,7 +17,7 @@ from backlash_ros.core.control.motion import Drive, drive_limits
 from backlash_ros.core.driver_check import FLOAT64, UNKNOWN, Heard, Message, all_fit, judge, table
 from backlash_ros.core.parameters import ParameterError, Parameters
 from backlash_ros.core.plant.transfer_function import TransferFunction
-from backlash_ros.nodes.driver_graph import similar_topics
+from backlash_ros.nodes.check_driver import similar_topics
 
 
 def test_a_good_driver_fits_and_its_backlash_is_told() -> None:
