@@ -58,7 +58,7 @@ class AdaptiveController:
         self.inverse, self.limits = inverse, limits
         self.motion = at_rest(inverse.v)
         self.compensating, self.lost_samples = True, 0
-        self.redesign = Redesign(executor or Executor()) if redesign else None
+        self.redesign = Redesign((executor or Executor()).open()) if redesign else None
         self._serial = serial
         self._interval: Interval | None = None  # that which began with the newest command
 
@@ -109,12 +109,12 @@ class AdaptiveController:
         """Do what the command did not have to wait for; who has no time for it leaves it out."""
         self.structure.prepare()
         self.estimator.refine()
-        redesign = self.redesign
-        if redesign and redesign.due(self.estimator.proposal, self.structure, self._serial):
-            # At once and together: x_hat and gains of two models do not fit each other.
-            self._adopt(redesign, redesign.considered)
-            if redesign.gains is not None:
-                self.structure.adopt(redesign.gains, self._source)
+        if self.redesign is not None:
+            gains = self.redesign.due(self.estimator.proposal, self.structure, self._serial)
+            if gains is not None:
+                # At once and together: x_hat and gains of two models do not fit each other.
+                self._adopt(self.redesign.considered)
+                self.structure.adopt(gains, self._source)
 
     def command_of(self, v: float) -> float:
         """The command at which the motor rests at a v that was reported."""
@@ -131,7 +131,7 @@ class AdaptiveController:
         self.inverse, self.motion, self.structure = before.inverse, before.motion, before.structure
         if self.redesign is not None and before.redesign is not None:
             self.redesign.considered = before.redesign.considered
-            self._adopt(self.redesign, before.redesign.adopted)
+            self._adopt(before.redesign.adopted)
         self.structure.restart()
 
     def retune(self, p: Parameters) -> None:
@@ -142,12 +142,12 @@ class AdaptiveController:
     def close(self) -> None:
         """Give back what estimator and designs hold elsewhere."""
         self.estimator.close()
-        if self.redesign is not None and self.redesign.channel is not None:
+        if self.redesign is not None:
             self.redesign.channel.close()
 
-    def _adopt(self, redesign: Redesign, model: StateModel | None) -> None:
-        redesign.adopted = model
-        if model is not None:
+    def _adopt(self, model: StateModel | None) -> None:
+        if self.redesign is not None and model is not None:
+            self.redesign.adopted = model
             self.estimator.adopt(model)
             if self._serial is not None:
                 self._serial.adopt(self._serial.before(model))
@@ -161,42 +161,36 @@ class AdaptiveController:
 class Redesign:
     """Has gains made for the better models of G that the estimator proposes, one at a time."""
 
-    executor: Executor
+    channel: Channel  # where they are made
     adopted: StateModel | None = None  # the learned G that is in use
     considered: StateModel | None = None  # the proposal that was designed for last
-    gains: object | None = None  # for it, None for the present ones
     failed: int = 0  # designs without a result
-    channel: Channel | None = None  # where they are made, from the first one on
-    _made: bool = False
-    _waited: int = 0  # samples for which gains that are made could not take over
+    _gains: object | None = None  # that are made and could not take over yet
+    _waited: int = 0  # samples for which they could not
 
     def due(
         self, proposal: StateModel | None, structure: ControlStructure, serial: SerialPlant | None,
-    ) -> bool:
-        """Whether the design for `considered` takes over now. proposal: the newest G."""
-        busy = self.channel is not None and self.channel.busy
-        if proposal is not None and proposal is not self.considered and not busy:
-            self.considered, self.gains, self._waited = proposal, None, 0
-            job = structure.redesign(proposal if serial is None else serial.before(proposal))
-            self._made = job is None
-            if job is not None:
-                self.channel = self.channel or self.executor.open()
-                self.channel.submit(_designed, job)
-        if self.channel is not None and self.channel.busy:
-            found = self.channel.poll()
-            if isinstance(found, Failure) and found.kind == LOST:
+    ) -> object | None:
+        """Gains for `considered` that take over now, None for none. proposal: the newest G."""
+        if proposal is not None and proposal is not self.considered and not self.channel.busy:
+            self.considered, self._gains, self._waited = proposal, None, 0
+            model = proposal if serial is None else serial.before(proposal)
+            self.channel.submit(_designed, structure.redesign(model))
+        found = self.channel.poll()
+        if isinstance(found, Failure):
+            if found.kind == LOST:
                 self.considered = None  # the same again, by another worker
-            elif isinstance(found, Failure):
+            else:
                 self.failed += 1
-            elif found is not None and found[0] is not None:
-                self.gains, self._made = found[0], True
-        if not self._made:
-            return False
+        elif found is not None:
+            self._gains, = found
+        if self._gains is None:
+            return None
         self._waited += 1
         if not structure.may_change and self._waited <= LONGEST_WAIT:
-            return False
-        self._made = False
-        return True
+            return None
+        gains, self._gains = self._gains, None
+        return gains
 
 
 def _designed(make: Callable[[], object | None]) -> tuple[object | None]:

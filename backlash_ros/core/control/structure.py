@@ -63,9 +63,9 @@ class ControlStructure:
     def prepare(self) -> None:
         """Do what the next command need not wait for; the next one does it where nobody asks."""
 
-    def redesign(self, model: StateModel) -> Callable[[], object | None] | None:
-        """What makes gains for a better G in any process, or None if unsafe; None: none to make."""
-        return None
+    def redesign(self, model: StateModel) -> Callable[[], object | None]:
+        """What makes gains for a better G in any process; None where they are no safe ones."""
+        return tuple  # there are none to make
 
     def adopt(self, gains: object, source: StateSource) -> None:
         """Use such gains from the next sample on, without a jump of v; source: of their x_hat."""
@@ -169,8 +169,7 @@ class PolePlacement(ControlStructure):
         asked = float(numerator @ self._r - denominator[1:] @ self._asked)
         self._asked = np.append(asked, self._asked)[:-1]
         self._largest_asked = max(self._largest_asked, abs(asked))
-        share = LARGEST_FEEDBACK if e.status is Status.TRACKING else \
-            LARGEST_IN_ACQUISITION
+        share = LARGEST_FEEDBACK if e.status is Status.TRACKING else LARGEST_IN_ACQUISITION
         reach = share * max(self._largest_asked, e.m * (e.c_r - e.c_l))
         u_d = min(max(u_d, asked - reach), asked + reach)
         v = inverse.step(u_d, e.m, e.c_r, e.c_l)

@@ -154,7 +154,7 @@ class PrintedLaw(LaggedLaw):
     Guards: a quotient that is not finite is skipped, the rest is projected into the bounds.
     """
 
-    skipped, _upward, _u_before = 0, True, 0.0
+    _upward, _u_before = True, 0.0
 
     def _learned(self, u: float, past: Interval, rising: bool | None) -> Estimate:
         old = self.estimate
@@ -163,15 +163,13 @@ class PrintedLaw(LaggedLaw):
             self._upward = u > self._u_before
         upward, self._u_before = self._upward, u
         w = old.c_r if upward else old.c_l
-        f = self._guarded(printed_f(u, past.y_m, old.m, w), old.f, self._f_bounds)
-        m = self._guarded(printed_m(u, past.y_m, f, w), old.m, self._bounds.m)
+        f = _guarded(printed_f(u, past.y_m, old.m, w), old.f, self._f_bounds)
+        m = _guarded(printed_m(u, past.y_m, f, w), old.m, self._bounds.m)
         c = printed_c(u, past.y_m, f, m)
-        c_r = self._guarded(c, old.c_r, self._bounds.c_r) if upward else old.c_r
-        c_l = old.c_l if upward else self._guarded(c, old.c_l, self._bounds.c_l)
+        c_r = _guarded(c, old.c_r, self._bounds.c_r) if upward else old.c_r
+        c_l = old.c_l if upward else _guarded(c, old.c_l, self._bounds.c_l)
         return Estimate(m, c_r, c_l, f, status=old.status)
 
-    def _guarded(self, value: float, old: float, bounds: tuple[float, float]) -> float:
-        if not isfinite(value):
-            self.skipped += 1
-            return old
-        return min(max(value, bounds[0]), bounds[1])
+
+def _guarded(value: float, old: float, bounds: tuple[float, float]) -> float:
+    return min(max(value, bounds[0]), bounds[1]) if isfinite(value) else old

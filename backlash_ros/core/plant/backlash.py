@@ -46,16 +46,12 @@ class Backlash:
             raise ParameterError('backlash.c_l', c_l, f'must be < backlash.c_r={c_r!r}',
                                  'the gap is c_r - c_l')
         self.m, self.c_r, self.c_l, self.u = m, c_r, c_l, u
-        self.region = Region.GAP
 
     def step(self, v: float) -> float:
         """Move the input to v and return u(t)."""
         # c_l < c_r puts the upward line m (v - c_r) below the downward one, so that the three
         # cases of (2.1) are one clamp of u(t-1) between the two lines.
-        upward, downward = self.m * (v - self.c_r), self.m * (v - self.c_l)
-        self.u = clamp(self.u, upward, downward)
-        self.region = Region.RIGHT if self.u == upward else \
-            Region.LEFT if self.u == downward else Region.GAP
+        self.u = clamp(self.u, self.m * (v - self.c_r), self.m * (v - self.c_l))
         return self.u
 
 
