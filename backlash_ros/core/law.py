@@ -19,7 +19,6 @@ class Interval(NamedTuple):
     v: float
     y_m: float
     u_d: float
-    f: float  # of (3.2)
     other: float = nan  # v that may have been applied instead, nan for no doubt
 
 

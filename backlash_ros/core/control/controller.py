@@ -99,10 +99,10 @@ class AdaptiveController:
         gap = used.c_r - used.c_l
         crossing = max(gap / inverse.take_up, self.limits.samples_across(gap))
         inputs = ControlInput(y_m, y, used, self._source, crossing)
-        u_d, v, f = self.structure.control(inputs, inverse)
+        u_d, v = self.structure.control(inputs, inverse)
         self.motion = self.limits.apply(v, self.motion)
         inverse.applied(self.motion.v)
-        self._interval = Interval(self.motion.v, y_m, u_d, f)
+        self._interval = Interval(self.motion.v, y_m, u_d)
         return ControlStep(y_m, y, u_d, self.motion.v, estimate)
 
     def refine(self) -> None:
@@ -266,7 +266,7 @@ class SerialPlant(StateSource):
             if (y - observer.predicted(u)) ** 2 > 100.0**2 * least and self._refused < OUTLIERS:
                 self._refused += 1
                 y = None
-        observer.update(y, Interval(u, nan, nan, nan))
+        observer.update(y, Interval(u, nan, nan))
         if y is not None:
             self._refused = 0
             self._taken += 1

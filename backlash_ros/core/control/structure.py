@@ -36,11 +36,10 @@ class ControlInput(NamedTuple):
 
 
 class Command(NamedTuple):
-    """Desired input u_d of G, the control v that shall cause it, and the gain f in use."""
+    """Desired input u_d of G, and the control v that shall cause it."""
 
     u_d: float
     v: float
-    f: float
 
 
 class ControlStructure:
@@ -92,7 +91,7 @@ class Proportional(ControlStructure):
         y_m, e, band = inputs.y_m, inputs.estimate, inverse.direction_band
         m, c_r, c_l, f = e.m, e.c_r, e.c_l, min(e.f, LARGEST_F_OVER_M * e.m)
         if f == 0.0 and not inverse.taking_up and inverse.direction(y_m, band) is Region.GAP:
-            return Command(y_m, inverse.v, f)  # first case of (2.3)
+            return Command(y_m, inverse.v)  # first case of (2.3)
         before, self._estimate = self._estimate, e
         if before is not None and before is not e and inverse.take_up < inf:
             # The inverse is slow only as far as u does not move: it cannot tell what u_d, or the
@@ -101,7 +100,7 @@ class Proportional(ControlStructure):
             if abs(now - then) > inverse.take_up:
                 inverse.slow_down()
         if f == 0.0:  # nothing to solve
-            return Command(y_m, inverse.step(y_m, m, c_r, c_l), f)
+            return Command(y_m, inverse.step(y_m, m, c_r, c_l))
         if e.learned:  # turns of u_d by less than three of its standard deviations are noise
             by_m, by_c = f * (y_m + f * c_r) / (m - f) ** 2, m * f / (m - f)
             band = max(band, 3.0 * hypot(by_m * e.std_m, by_c * max(e.std_c_r, e.std_c_l)))
@@ -115,24 +114,24 @@ class Proportional(ControlStructure):
             for side, u_d in solutions:
                 if side is inverse.side and inverse.direction(u_d, band) is Region.GAP:
                     v = inverse.step(u_d, m, c_r, c_l, band)  # u_d rests, v goes on to its line
-                    return Command(y_m + f * v, v, f)
+                    return Command(y_m + f * v, v)
         elif (
             abs(held - inverse.extreme) <= 1e-12 * (abs(held) + abs(v))  # but for rounding
             or inverse.direction(held, band) is Region.GAP
         ):
-            return Command(held, v, f)  # first case of (3.3): u_d rests, and so does v
+            return Command(held, v)  # first case of (3.3): u_d rests, and so does v
         for side, u_d in solutions:
             if inverse.direction(u_d, band) is side:
-                return Command(u_d, inverse.step(u_d, m, c_r, c_l, band), f)
+                return Command(u_d, inverse.step(u_d, m, c_r, c_l, band))
         if abs(held) > (abs(y_m) + abs(f) * max(c_r, -c_l)) / (1.0 - LARGEST_F_OVER_M):
             # New estimates have moved both lines so far from v that no u_d could have led there.
             side, u_d = solutions[0]
             inverse.aim(u_d, side)
             v = inverse.proceed(m, c_r, c_l)
-            return Command(y_m + f * v, v, f)
+            return Command(y_m + f * v, v)
         if band == 0.0:
             inverse.extreme = held
-        return Command(held, v, f)
+        return Command(held, v)
 
 
 def _on_the_line(y_m: float, e: Estimate, side: Region) -> float:
@@ -175,4 +174,4 @@ class PolePlacement(ControlStructure):
         v = inverse.step(u_d, e.m, e.c_r, e.c_l)
         self._w = np.array([self._companion @ w_1, self._companion @ w_2])
         self._w[:, :1] += [[u_d], [inputs.y]]
-        return Command(u_d, v, 0.0)
+        return Command(u_d, v)

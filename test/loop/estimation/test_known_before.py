@@ -30,7 +30,7 @@ def answers(u: list[float], late: int = 0) -> NDArray[np.float64]:
 
 
 def learn(estimator: Law, v: float, y: float) -> None:
-    estimator.update(y, Interval(v, v, v, 0.0))
+    estimator.update(y, Interval(v, v, v))
     estimator.refine()
 
 

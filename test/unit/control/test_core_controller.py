@@ -46,8 +46,8 @@ def test_output_is_paired_with_what_was_applied_before_it() -> None:
     c.step(0.2, 3.0)
     c.refine()
     assert estimator.updates == [
-        (0.1, Interval(first.v, 1.0, first.u_d, 0.22)),
-        (0.2, Interval(second.v, 2.0, second.u_d, 0.22))]
+        (0.1, Interval(first.v, 1.0, first.u_d)),
+        (0.2, Interval(second.v, 2.0, second.u_d))]
 
 
 def test_a_command_uses_what_its_output_has_taught() -> None:

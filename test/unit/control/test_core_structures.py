@@ -55,8 +55,7 @@ def test_u_d_is_y_m_plus_f_v_and_v_satisfies_the_printed_inverse_at_the_same_tim
     for play, share, y_m in samples:
         command = control(y_m, estimate_of(play, share), inverse)
         slack = tolerance(play, y_m, command.u_d)
-        assert command.f == pytest.approx(share * play.m)
-        assert command.u_d == pytest.approx(y_m + command.f * command.v, abs=slack)
+        assert command.u_d == pytest.approx(y_m + share * play.m * command.v, abs=slack)
         assert command.v == inverse.v
         if share >= 0.0:
             turns = (command.u_d - u_d_before, u_d_before - command.u_d)
@@ -70,10 +69,9 @@ def test_u_d_is_y_m_plus_f_v_and_v_satisfies_the_printed_inverse_at_the_same_tim
        share=st.one_of(st.just(1.0), st.floats(0.99, 1.01), st.floats(0.8, 100.0)))
 def test_f_near_or_beyond_m_is_limited(play: Play, y_m: float, share: float) -> None:
     command = control(y_m, estimate_of(play, share), BacklashInverse())
-    assert command.f == pytest.approx(LARGEST_SHARE * play.m)
     assert isfinite(command.u_d)
     assert command.u_d == pytest.approx(
-        y_m + command.f * command.v, abs=tolerance(play, y_m, command.u_d))
+        y_m + LARGEST_SHARE * play.m * command.v, abs=tolerance(play, y_m, command.u_d))
     assert LARGEST_F_OVER_M == LARGEST_SHARE
 
 
@@ -84,7 +82,7 @@ def test_v_does_not_stay_where_estimates_far_off_have_led_it() -> None:
         far = control(y_m, before, inverse)
     assert far.v < -4000.0
     command = control(-10.0, now, inverse)
-    assert command.u_d == pytest.approx(-10.0 + command.f * command.v)
+    assert command.u_d == pytest.approx(-10.0 + LARGEST_SHARE * now.m * command.v)
     assert abs(command.u_d) <= 1.001 * 10.0 / (1.0 - LARGEST_F_OVER_M)
 
 

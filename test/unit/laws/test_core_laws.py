@@ -46,7 +46,7 @@ def test_guarded_law_stays_finite_and_within_its_bounds(data: list[tuple[float, 
     estimator = PrintedLaw(Estimate(0.696, 0.5, -0.5, 0.22), bounds, (-0.5, 0.5), KnownInput())
     # The paper's first sample, u = y_m = 0, leads to 0/0 in m and c.
     for u, y_m in [(0.0, 0.0), *data]:
-        estimator.update(u, Interval(v=0.0, y_m=y_m, u_d=0.0, f=estimator.estimate.f))
+        estimator.update(u, Interval(v=0.0, y_m=y_m, u_d=0.0))
         e = estimator.estimate
         assert bounds.m[0] <= e.m <= bounds.m[1]
         assert bounds.c_r[0] <= e.c_r <= bounds.c_r[1]

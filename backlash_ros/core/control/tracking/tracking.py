@@ -6,9 +6,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 
-import numpy as np
-from numpy.typing import NDArray
-
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.structure import Command, ControlInput, ControlStructure
 from backlash_ros.core.control.tracking.design import TrackingDesign, better_design, design
@@ -20,7 +17,7 @@ from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import TrackingWeights
 from backlash_ros.core.plant.backlash import Region
 from backlash_ros.core.plant.numerics import NoiseLevel
-from backlash_ros.core.plant.transfer_function import StateModel
+from backlash_ros.core.plant.transfer_function import Array, StateModel
 
 FADING = 0.8  # per sample, of what is handed over
 
@@ -58,7 +55,7 @@ class Tracking(ControlStructure):
         self._engaged_for = 0  # samples since v has crossed the gap
         # y, the covariance of x_hat and who knows both, of a command that the next one was not
         # prepared after.
-        self._newest: tuple[float, NDArray[np.float64] | None, StateSource] | None = None
+        self._newest: tuple[float, Array | None, StateSource] | None = None
 
     @property
     def may_change(self) -> bool:
@@ -170,7 +167,7 @@ class Tracking(ControlStructure):
         self._engaged_for = 0 if crosses else self._engaged_for + 1
         feedback.integrate(plan.design.model.c * plan.x[0] - y, inverse.limited)
         self._newest = y, x_cov, source
-        return Command(u_d, v, 0.0)
+        return Command(u_d, v)
 
     def prepare(self) -> None:
         """Go on to the next sample, if that is still to be done."""
