@@ -19,7 +19,7 @@ from backlash_ros.core.control.structure import (
     ControlInput,
 )
 from backlash_ros.core.control.tracking.design import feedback_around
-from backlash_ros.core.control.tracking.rest import TOLERANCE
+from backlash_ros.core.control.tracking.feedback import TOLERANCE
 from backlash_ros.core.control.tracking.tracking import FADING
 
 ROUNDING = 1e-9

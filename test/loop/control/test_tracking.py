@@ -15,8 +15,7 @@ from backlash_ros.core.control.tracking.design import (
     modulus_margin,
     preview_gains,
 )
-from backlash_ros.core.control.tracking.feedback import shrunk_crossings
-from backlash_ros.core.control.tracking.rest import SHORT, Mode, Rest
+from backlash_ros.core.control.tracking.feedback import SHORT, Mode, Rest, shrunk_crossings
 from backlash_ros.core.control.tracking.trajectory import IdealTrajectory
 from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.parameters import Parameters

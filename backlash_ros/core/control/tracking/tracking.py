@@ -9,8 +9,7 @@ from itertools import pairwise
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.structure import Command, ControlInput, ControlStructure
 from backlash_ros.core.control.tracking.design import TrackingDesign, better_design, design
-from backlash_ros.core.control.tracking.feedback import StateFeedback, shrunk_crossings
-from backlash_ros.core.control.tracking.rest import OFF, Rest
+from backlash_ros.core.control.tracking.feedback import OFF, Rest, StateFeedback, shrunk_crossings
 from backlash_ros.core.control.tracking.trajectory import IdealTrajectory
 from backlash_ros.core.law import StateSource
 from backlash_ros.core.parameters import Parameters
@@ -148,10 +147,10 @@ class Tracking(ControlStructure):
         mode = rest.decide(y, self._noise_std, plan, deviation,
                            None if x_cov is None else feedback.x_std, inverse.side, pull,
                            abs(correction) > noise)
+        if mode.steps and mode is not before:
+            rest.target = inverse.extreme, 0.0  # stay where v is
         if mode.steps and x_cov is not None:
             rest.step(estimate, plan, pull, inverse, mode is not before)
-        elif mode.steps and not before.steps:
-            rest.stay(inverse)
         side = self._side(turned, u_d, noise, inverse)
         # Whatever makes u_d: nothing leads it further from what the reference asks for.
         reach = feedback.bounds[1] + (abs(added) if hand_over.widens else 0.0)
