@@ -40,9 +40,7 @@ class BacklashInverse:
             # u is held until v arrives: it turns only where u_d lies on the other side of that.
             self._note_on_the_way()
             side = Region(-self.side) if (self._u - u_d) * self.side > band else self.side
-        elif side is Region.GAP:
-            return self.v
-        elif self.side is Region.GAP:
+        elif self.side is Region.GAP and side is not Region.GAP:
             self.side, self._u, self.taking_up = side, self.extreme, True
         return self.follow(side, u_d, m, c_r, c_l)
 
@@ -66,8 +64,7 @@ class BacklashInverse:
 
     def aim(self, u_d: float, side: Region) -> None:
         """Let the next step go to u_d on the line of this side, whatever it came from."""
-        if not self.taking_up:
-            self._u = self.extreme
+        self._u = self.held_u
         self.side, self.extreme, self.taking_up = side, u_d, True
 
     def proceed(self, m: float, c_r: float, c_l: float) -> float:

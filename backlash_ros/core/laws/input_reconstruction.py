@@ -58,13 +58,12 @@ class InputReconstruction:
         self._step[:n, :n], self._step[:n, n] = state.a, state.b / self._scale
         self._step[n, n] = 1.0
         self._step[n + 1:, n:-1] = np.eye(lag)
-        variance = nan
         try:
             before = self._stationary(n + 1)
             gain, self._covariance = self._gain_of(before), self._measured(before)
             variance = float(self._covariance[-1, -1])
         except (np.linalg.LinAlgError, ValueError):
-            pass
+            variance = nan
         if not 0.0 < variance < inf:  # rounding has taken over
             raise ParameterError(
                 'estimator.output_noise_std', noise_std, 'is so large that y says nothing of u',

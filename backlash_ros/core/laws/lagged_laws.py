@@ -37,6 +37,8 @@ STROKE = 8  # samples to either side over which u moves on in one direction
 class LaggedLaw(Law):
     """Learns from u reconstructed some samples late, and what was applied when it acted."""
 
+    innovation, u_hat = nan, 0.0
+
     def __init__(
         self, initial: Estimate, bounds: Bounds, f_bounds: tuple[float, float],
         reconstruction: InputReconstruction,
@@ -48,20 +50,13 @@ class LaggedLaw(Law):
         self._agreement = Agreement()
 
     @property
-    def u_hat(self) -> float:
-        return self._reconstruction.u_hat
-
-    @property
     def x_hat(self) -> Array:
         return self._reconstruction.x_hat
 
-    @property
-    def innovation(self) -> float:
-        return self._reconstruction.innovation
-
     def update(self, y: float | None, interval: Interval) -> None:
         """Take in y(k) and learn from the sample that the reconstruction has reached."""
-        u = self._reconstruction.update(y)
+        self.u_hat = u = self._reconstruction.update(y)
+        self.innovation = self._reconstruction.innovation
         self._past.append(u)
         self._applied.append(interval)  # the newest carried u(k-1), the oldest u(k-lag)
         if not (self.adapting and self._reconstruction.ready):

@@ -108,8 +108,7 @@ class StateModel:
         self.c = float(triangle[0, 0])
         stable = [abs(pole) for pole in model.poles if abs(pole) < 1.0 - ON_CIRCLE]
         self.memory = memory_of(max(stable, default=0.0))
-        rest = np.zeros((n + 1, n + 1))
-        rest[:n, :n], rest[:n, n], rest[n, 0] = self.a - np.eye(n), self.b, self.c
+        rest = np.block([[self.a - np.eye(n), self.b[:, None]], [self.c * np.eye(1, n + 1)]])
         self.equilibrium: Array = np.linalg.lstsq(rest, np.eye(n + 1)[n])[0][:n]
 
 
