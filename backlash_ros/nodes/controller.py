@@ -58,11 +58,11 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
             p.sample_period, from_zero=not p.lockstep and p.wait_for_subscribers > 0
         )
         # Raises ParameterError before anybody is found. While unconfigured they are not used.
-        self.loops = self._make_loops(counter, {
+        self.loops = JointLoops(p, self._io.publish, self._io.driver_of, {}, counter, {
             # In lockstep there is the simulated plant alone, which begins at 0.
             joint: initial if isfinite(initial) and not p.lockstep else None
             for joint in p.joint_names for initial in [p.of_joint(joint).control.initial]
-        }, Executor())
+        })
         # A fit that shared the process of the loop would hold up its commands.
         self._executor: Executor = \
             Executor() if p.lockstep else WorkerExecutor(assembly.WORKER_MODULES)
@@ -79,8 +79,7 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
         # A stalled controller goes on with the newest values; in lockstep none may be skipped.
         # Woken by each y_m, the process would take half as much time again.
         self._io.listen_to(
-            to.reference, lambda y_m, *_: self._on_reference(y_m), KEPT_QOS if p.lockstep else 1,
-            polled=not p.lockstep,
+            to.reference, self._on_reference, KEPT_QOS if p.lockstep else 1, polled=not p.lockstep,
         )
         self.joints = [
             Joint(self, name, p.of_joint(name), self._io, loop)
@@ -99,7 +98,14 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
         else:
             self.every(0.1, self._look_for_silence)
         for joint in self.joints:
-            self._warn_of(joint)
+            for warning in assembly.warnings_of(joint.p, with_reference=False):
+                self.log.warning(line_of(joint.name, warning))
+            if assembly.takes_model_as_exact(joint.p):
+                self.log.info(line_of(
+                    joint.name, 'plant.uncertainty is 0: G is taken as exact, which no data can '
+                    'check. Where it is not, estimates are off by more than their deviations: 0.2 '
+                    'allows for time constants that are 20 % off'
+                ))
         name = self.resolve_topic_name
         self.log.info(
             f'started: {name(to.output)} and {name(to.reference)} in, {name(to.control)} out'
@@ -113,29 +119,12 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
             untyped.trigger_configure()
             untyped.trigger_activate()
 
-    def _make_loops(
-        self, counter: SampleCounter, v: Mapping[str, float | None], executor: Executor,
-    ) -> JointLoops:
-        """Loops that begin with the estimates of before, and with v; raises ParameterError."""
-        p, io = self.settings, self._io
-        before = {joint: assembly.known_before(p.of_joint(joint)) for joint in p.joint_names}
-        return JointLoops(p, io.publish, io.driver_of, before, counter, v, executor)
-
-    def _warn_of(self, joint: Joint) -> None:
-        for warning in assembly.warnings_of(joint.p, with_reference=False):
-            self.log.warning(line_of(joint.name, warning))
-        if assembly.takes_model_as_exact(joint.p):
-            self.log.info(line_of(
-                joint.name, 'plant.uncertainty is 0: G is taken as exact, which no data can '
-                'check. Where it is not, estimates are off by more than their deviations: 0.2 '
-                'allows for time constants that are 20 % off'
-            ))
-
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         try:
-            loops = self.loops
+            io, loops = self._io, self.loops
             v = {name: loop.v if loop.knows_v else None for name, loop in loops.by_name.items()}
-            self.loops = self._make_loops(loops.counter, v, self._executor)
+            self.loops = JointLoops(self.settings, io.publish, io.driver_of, {}, loops.counter, v,
+                                    self._executor)
         except ParameterError as error:  # rclpy itself would swallow it without a word
             self.log.error(str(error))
             return TransitionCallbackReturn.FAILURE
@@ -205,18 +194,17 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
 
     def _send_last(self) -> None:
         """Send what ends all loops; v is held where that takes too long, or SIGKILL comes next."""
-        p, told, cut_short = self.settings, time.monotonic(), False
+        p, told, why = self.settings, time.monotonic(), ''
         step_s, deadline = max(p.sample_period, 1e-3), told + p.timeout.ramp
         while self.loops.send_next():
             late = time.monotonic() + step_s > deadline
-            if not cut_short and (late or SIGTERM in self.signals[1:]):
-                cut_short, why = True, f'timeout.ramp={p.timeout.ramp:g} s' if late else 'SIGTERM'
+            if not why and (late or SIGTERM in self.signals[1:]):
+                why = f'timeout.ramp={p.timeout.ramp:g} s' if late else 'SIGTERM'
                 for loop in self.loops.end('hold'):
                     if loop.v != loop.core.limits.zero:
                         self.log.warning(
                             f'v={loop.v:.6g} is held: {why} came before it reached zero'
                         )
-                continue
             time.sleep(step_s)
             if time.monotonic() > told + DIAGNOSTICS_PERIOD_S:
                 told = time.monotonic()
@@ -236,7 +224,7 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
             joint.close()
         self._executor.close()
 
-    def _on_reference(self, y_m: Mapping[str, float]) -> None:
+    def _on_reference(self, y_m: Mapping[str, float], *_: object) -> None:
         if self.configured:
             self.loops.take_references(y_m)
             if self.settings.lockstep:

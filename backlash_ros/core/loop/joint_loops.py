@@ -16,7 +16,8 @@ from backlash_ros.core.parameters import Parameters
 class JointLoops:
     """Answers a message about all joints with one of commands for all; no loop knows another.
 
-    driver: what can be asked about that of a joint. by_name: the loops, in the order of `joints`; a
+    driver: what can be asked about that of a joint. before: estimates to begin with, of joints that
+    do not begin with what was known before. by_name: the loops, in the order of `joints`; a
     single one may be nameless. turns: for each sample the loop that may look after fits then, or
     none.
     """
@@ -32,7 +33,7 @@ class JointLoops:
         self.by_name = {
             joint: ControlLoop(
                 p.of_joint(joint), partial(self._commands.__setitem__, joint), driver(joint),
-                before[joint], counter, (v or {}).get(joint), executor,
+                before.get(joint), counter, (v or {}).get(joint), executor,
             ) for joint in p.joint_names
         }
         self.loops = tuple(self.by_name.values())

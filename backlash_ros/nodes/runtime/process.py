@@ -3,16 +3,14 @@
 import argparse
 import contextlib
 import ctypes
-import difflib
 import gc
 import json
 import os
-import re
 import signal
 import struct
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from itertools import pairwise
 from math import isfinite
 from pathlib import Path
@@ -240,8 +238,10 @@ def run(
         except (ParameterError, NameValidationException) as error:
             print(f'{executable}: {" ".join(str(error).split())}', file=sys.stderr)
             return BAD_INPUT
-        for complaint in complaints(arguments, executable, node.get_fully_qualified_name()):
-            node.log.warning(complaint)
+        for option, file in pairwise(arguments):
+            if option == '--params-file' and (
+                    complaint := unreached(file, node.get_fully_qualified_name())):
+                node.log.warning(complaint)
         node.signals = signals
         executor = PromptExecutor(node)
         code = FAILED  # unless the work comes to its end
@@ -326,33 +326,14 @@ def _ros_parameter(name: str, value: Value) -> RosParameter:
     return RosParameter(name, value=list(value) if isinstance(value, tuple) else value)
 
 
-def complaints(arguments: Sequence[str], executable: str, full_name: str) -> Iterator[str]:
-    """What to do for each section of given files that ROS 2 passes over without a word."""
-    for option, file in pairwise(arguments):
-        if option == '--params-file':
-            import yaml  # most nodes start without a file
+def unreached(file: str, full_name: str) -> str:
+    """What to do with a parameter file that ROS 2 passes over without a word, empty if none."""
+    import yaml  # most nodes start without a file
 
-            # ROS 2 itself has refused what cannot be read.
-            content = yaml.safe_load(Path(file).read_text(encoding='utf-8'))
-            for name in unused(list(map(str, content or ())), executable, full_name):
-                yield f'{file}: section {name} is not for {full_name}, its values are not used: ' \
-                    f'write /**/{full_name.rpartition("/")[2]}'
-
-
-def unused(sections: Sequence[str], executable: str, full_name: str) -> list[str]:
-    """Sections that do not reach the node though they seem to be meant for it.
-
-    None where another one of its name does. A section with a namespace may be another axis.
-    """
-    *namespace, own = full_name.strip('/').split('/')
-    meant = []
-    for section in sections:
-        *above, last = section.strip('/').split('/')
-        if last == own or difflib.get_close_matches(last, [executable], cutoff=0.8):
-            # ** stands for any namespaces.
-            pattern = re.escape(f'/{section.strip("/")}').replace(r'/\*\*', '(/[^/]+)*')
-            if re.fullmatch(pattern.replace(r'/\*', '/[^/]+'), full_name):
-                return []
-            if not (namespace and above):
-                meant.append(section)
-    return meant
+    namespace, _, own = full_name.strip('/').rpartition('/')
+    ways = {'**', f'**/{own}', f'*/{own}', f'{namespace}/**', f'{namespace}/{own}'.strip('/')}
+    # ROS 2 itself has refused what cannot be read.
+    sections = yaml.safe_load(Path(file).read_text(encoding='utf-8'))
+    if not ways.isdisjoint(str(section).strip('/') for section in sections or ()):
+        return ''
+    return f'{file}: no section is for {full_name}, its values are not used: write /**/{own}'

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
@@ -15,7 +16,7 @@ from backlash_ros.middleware import PROFILE, prefer_loopback
 from backlash_ros.nodes.control.publishing import watched_values
 from backlash_ros.nodes.control.rivals import ENDPOINT, SINCE, Rival, Rivals
 from backlash_ros.nodes.runtime import messages
-from backlash_ros.nodes.runtime.process import unused
+from backlash_ros.nodes.runtime.process import unreached
 
 HERE = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
 
@@ -79,22 +80,20 @@ def test_joints_of_a_sender_whose_highest_byte_comes_first_are_understood() -> N
     assert messages.JointReader().read(message + bytes(4)) == content
 
 
-@pytest.mark.parametrize(('sections', 'full_name'), [
-    (['/**', '/plant'], '/arm/plant'), (['/arm/plant'], '/plant'), (['/plant'], '/left_plant'),
-    (['/plnt'], '/plant'),
+@pytest.mark.parametrize(('sections', 'full_name', 'reached'), [
+    (['/**', '/plnt'], '/plant', True), (['plant'], '/plant', True),
+    (['/**/plant'], '/plant', True), (['/**/plant'], '/a/b/plant', True),
+    (['/*/plant'], '/a/plant', True), (['/pan/**'], '/pan/plant', True),
+    (['/pan/plant', '/tilt/plant'], '/pan/plant', True),
+    (['/arm/plant'], '/plant', False), (['/plant'], '/left_plant', False),
+    (['/plant'], '/arm/plant', False), (['/plnt', '/controller'], '/plant', False),
+    (['/tilt/**'], '/pan/plant', False),
 ])
-def test_section_that_does_not_reach_its_node_is_named(sections, full_name):
-    assert list(unused(sections, 'plant', full_name)) == [sections[-1]]
-
-
-@pytest.mark.parametrize(('sections', 'full_name'), [
-    (['/**', '/plant'], '/plant'), (['/**/plant'], '/plant'), (['/**/plant'], '/a/b/plant'),
-    (['/*/plant'], '/a/plant'), (['/pan/plant', '/tilt/plant'], '/pan/plant'),
-    (['/**', '/tilt/plant'], '/pan/plant'), (['/**', '/controller', '/somebody_else'], '/plant'),
-    (['/tilt/**'], '/pan/plant'),
-])
-def test_other_sections_are_no_concern(sections: list[str], full_name: str) -> None:
-    assert list(unused(sections, 'plant', full_name)) == []
+def test_a_file_that_does_not_reach_its_node_is_named(sections, full_name, reached, tmp_path):
+    file = tmp_path / 'parameters.yaml'
+    file.write_text(yaml.safe_dump({name: {'ros__parameters': {'seed': 1}} for name in sections}))
+    said = unreached(str(file), full_name)
+    assert said == '' if reached else f'no section is for {full_name}' in said
 
 
 SIGNALS = tuple(float(i) for i, _ in enumerate(topics.SIGNAL_LABELS))
