@@ -142,7 +142,7 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         self.active = True
-        self._rivals.begin(active=True)
+        self._rivals.follow(active=True)
         if self._io.topics.output in self._io.heard:
             # v goes on from the last command, but what the plant did meanwhile is unknown, and
             # that nobody was listened to is no silence of the driver.
@@ -186,7 +186,7 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
                 self._send_last()
                 for joint in self.joints:
                     joint.model.publish(joint.loop, joint.p, wait_s=1)
-            self._rivals.begin(active=False)
+            self._rivals.follow(active=False)
             self._diagnose()
         return TransitionCallbackReturn.SUCCESS
 

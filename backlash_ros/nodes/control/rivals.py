@@ -96,7 +96,7 @@ class Rivals:
         return tuple(sorted(found))
 
 
-class RivalWatch:
+class RivalWatch(Rivals):
     """Looks out for other publishers of the command while the node runs.
 
     Of the controllers of one machine the one with the lock commands, as far as those of others let
@@ -105,15 +105,13 @@ class RivalWatch:
 
     def __init__(self, node: ProcessNode, io: DriverIo, changed: Callable[[], None]) -> None:
         self.topic = node.resolve_topic_name(io.topics.control)
-        self.found: tuple[Rival, ...] = ()
         self._node, self._changed = node, changed
-        self._lock = CommandLock(node.context.get_domain_id(), self.topic)
         # What discovery mostly takes: a publisher that is found so soon after the node was made was
         # there before it.
-        self._rivals = Rivals(self._identity_after(io.advertise), node.begun_at + 0.7)
-        self._others: frozenset[str] = frozenset()
-        # The rivals, and whether any was first, as they were at the look before.
-        self._told: tuple[tuple[Rival, ...], bool] = (), False
+        super().__init__(self._identity_after(io.advertise), node.begun_at + 0.7)
+        self.found: tuple[Rival, ...] = ()
+        self._lock = CommandLock(node.context.get_domain_id(), self.topic)
+        self._told: tuple[tuple[Rival, ...], bool] = (), False  # found, any_first at the look before
         self._hello_until = -inf  # until then others are told at every look who was first
         self._diagnostics = node.listen(
             DiagnosticArray, topics.DIAGNOSTICS, self._hear, 100, polled=True
@@ -122,37 +120,38 @@ class RivalWatch:
 
     @property
     def settled(self) -> bool:
-        return time.monotonic() >= self._rivals.settled_at
+        return time.monotonic() >= self.settled_at
 
     @property
     def any_first(self) -> bool:
         """Whether somebody else is in charge of the actuator."""
-        return self._rivals.since_ns == WAITS_NS or any(rival.was_first for rival in self.found)
+        return self.since_ns == WAITS_NS or any(rival.was_first for rival in self.found)
 
     @property
     def claim(self) -> dict[str, object]:
-        return {ENDPOINT: self._rivals.own, SINCE: self._rivals.since_ns}
+        return {ENDPOINT: self.own, SINCE: self.since_ns}
 
-    def begin(self, active: bool) -> None:
+    def follow(self, active: bool) -> None:
+        """Take note of whether the controller is active."""
         if not active:
             self._lock.release()
-        self._rivals.begin(WAITS_NS if active else 0, time.monotonic())
+        self.begin(WAITS_NS if active else 0, time.monotonic())
         self.look()
 
     def look(self) -> None:
         now, node = time.monotonic(), self._node
-        if self._rivals.since_ns == WAITS_NS and self._lock.take():
-            self._rivals.begin(time.time_ns(), now)
+        if self.since_ns == WAITS_NS and self._lock.take():
+            self.begin(time.time_ns(), now)
         # Counting is ten times cheaper than asking who they are.
         infos = node.get_publishers_info_by_topic(self.topic) \
             if node.count_publishers(self.topic) > 1 else []
         others = {identity_of(info): name_of(info) for info in infos}
-        others.pop(self._rivals.own, None)
-        if self._others != others.keys():
-            self._others, self._hello_until = frozenset(others), now + 2.0
+        others.pop(self.own, None)
+        if others.keys() != self._known.keys():
+            self._hello_until = now + 2.0
         if others:
             serve_polled(self._diagnostics)
-        self.found = self._rivals.among(others, now)
+        self.found = self.among(others, now)
         before, self._told = self._told, (self.found, self.any_first)
         if before[0] and not self.found:
             node.log.info(f'nobody else publishes {self.topic} any more')
@@ -162,7 +161,7 @@ class RivalWatch:
     def _hear(self, message: DiagnosticArray, info: dict[str, Any]) -> None:
         for status in message.status:
             values = {each.key: each.value for each in status.values}
-            self._rivals.hear(values, 1e-9 * arrival_ns(info['received_timestamp']))
+            self.hear(values, 1e-9 * arrival_ns(info['received_timestamp']))
 
     def _identity_after(self, advertise: Callable[[], object]) -> str:
         """The identity of the publisher that advertise makes; rclpy has no way to ask for it."""
