@@ -111,7 +111,7 @@ class RivalWatch(Rivals):
         super().__init__(self._identity_after(io.advertise), node.begun_at + 0.7)
         self.found: tuple[Rival, ...] = ()
         self._lock = CommandLock(node.context.get_domain_id(), self.topic)
-        self._told: tuple[tuple[Rival, ...], bool] = (), False  # found, any_first at the look before
+        self._told: tuple[tuple[Rival, ...], bool] = (), False  # at the look before
         self._hello_until = -inf  # until then others are told at every look who was first
         self._diagnostics = node.listen(
             DiagnosticArray, topics.DIAGNOSTICS, self._hear, 100, polled=True
