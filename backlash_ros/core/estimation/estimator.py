@@ -56,7 +56,7 @@ def fitted(
     fit, kept = belief.fit, belief.kept
     if fit is None or belief.published is None:
         return Fitted(belief)
-    part = record.swapped(kept.swapped - swapped).between(kept.first, belief.end)
+    part = record.swapped(kept.swapped ^ swapped).between(kept.first, belief.end)
     run = setup.problem(part, kept.older).at(fit)
     newest = slice(-min(len(part.v), 4 * setup.family.memory, settings.ROWS), None)
     u, y = run.u[newest], part.y[newest]

@@ -173,8 +173,9 @@ def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]
                 for _ in range(FEW_STEPS):
                     there = p.step(there, held=True)
                 behind = max(likeliest - p.log_posterior(there, weights), 1.0)
-                if nearer <= 2.0:
-                    wider = max(0.5 / behind - reach**-2, 0.0) * _apart(there, best)
+                if nearer <= 2.0:  # the furthest that is likely may lie well before this one
+                    more = max(0.5 / behind - reach**-2, 0.0) * _apart(there, best)
+                    wider = max(wider, more, key=np.trace)
                 if not there.m > 0.0:
                     break
                 beside = there if behind < 0.25 * reach**2 else None

@@ -187,8 +187,7 @@ class WindowFit:
 
     def alike(self, other: WindowFit) -> bool:
         """Whether the backlashes of two fits differ by chance."""
-        cov = self.crossings_cov + other.crossings_cov
-        return agree(self.crossings, other.crossings, cov)
+        return agree(self.crossings, other.crossings, self.crossings_cov + other.crossings_cov)
 
     @property
     def crossings_std(self) -> Array:

@@ -32,9 +32,14 @@ def learn(setup: Setup, record: Window, before: Belief) -> Belief:
     Raises nothing: where the numbers get too large, it begins anew with the newest samples.
     """
     look = {State.SEARCHING: _searching, State.KNOWN: _known, State.DOUBTED: _doubted}
+    kept, record = before.kept, record.without(before.kept.rejected)
     try:
         with np.errstate(all='ignore'):
-            return look[before.state](setup, record.without(before.kept.rejected), before)
+            if before.fit is not None:  # late commands alone contradict nothing
+                p, since = setup.problem(record, kept.older), before.end - setup.family.memory
+                record, swapped = likelier(p, before.fit, record, since, kept.swapped)
+                before = before._replace(kept=kept._replace(swapped=swapped))
+            return look[before.state](setup, record, before)
     except np.linalg.LinAlgError:
         first = max(record.end - settings.FIRST_FIT, record.first)
         return _begun_anew(before, first, record.end, record.end + FEWEST)
@@ -59,21 +64,20 @@ def _searching(setup: Setup, record: Window, before: Belief) -> Belief:
     # What many reversals do not tell, a few more will not.
     growth = 2.0 if tried and tried.left.turns >= settings.HELD_REVERSALS else settings.GROWTH
     search_at = record.end + max(int(count * (growth - 1.0)), FEWEST)
-    found = afresh(setup, record, also=tried, walks=True)
-    part = shorter = record
-    why = _why(setup, found, record, before)
+    fit, shorter = afresh(setup, record, also=tried, walks=True), record
+    why = _why(setup, fit, record, before)
+    part, found, swapped = _with_commands(setup, record, fit, before.kept.swapped)
     while why in (Status.INCONSISTENT, Status.NOT_EXCITED) and len(shorter.v) >= 3 * shortest:
         # What happened at its beginning may have spoilt a record.
         shorter = shorter.between(shorter.end - len(shorter.v) // 3)
-        newest = afresh(setup, shorter)
-        if newest is not None and setup.is_known(newest):
-            found, part = newest, shorter
+        newest = _with_commands(setup, shorter, afresh(setup, shorter), before.kept.swapped)
+        if newest[1] is not None and setup.is_known(newest[1]):
+            part, found, swapped = newest
             break
     after = before._replace(end=record.end, next_at=search_at, thorough=(search_at, 0.0),
                             found=None, reason=why, coasts=False)
     if found is None:
         return after
-    part, found, swapped = _with_commands(setup, part, found, before.kept.swapped)
     known = before.published and before.published.crossings
     if coasts(setup.problem(part), found, known):
         after = after._replace(coasts=True, reason=Status.INCONSISTENT)
@@ -91,11 +95,13 @@ def _searching(setup: Setup, record: Window, before: Belief) -> Belief:
 
 
 def _with_commands(
-    setup: Setup, record: Window, found: WindowFit, swapped: frozenset[int],
-) -> tuple[Window, WindowFit, frozenset[int]]:
+    setup: Setup, record: Window, found: WindowFit | None, swapped: frozenset[int],
+) -> tuple[Window, WindowFit | None, frozenset[int]]:
     """The record, the fit and the commands that go with each other, found in turn."""
+    if found is None or not np.isfinite(record.other).any():
+        return record, found, swapped
     sent = record, found, swapped
-    for _ in range(4 if np.isfinite(record.other).any() else 0):
+    for _ in range(4):
         before = swapped
         record, swapped = likelier(setup.problem(record), found, record, record.first, before)
         if swapped == before:
@@ -142,12 +148,6 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
     count, new = len(record.v), before.end - record.first
     problem = setup.problem(record, kept.older)
     fit = problem.fitted(held, FEW_STEPS)
-    since = before.end - setup.family.memory
-    record, others = likelier(problem, fit, record, since, kept.swapped)
-    if others != kept.swapped:
-        kept = kept._replace(swapped=others)
-        problem = setup.problem(record, kept.older)
-        fit = problem.fitted(fit, FEW_STEPS)
     wild = outliers(problem.residual(fit)[new:] / held.noise)
     if wild.any():
         numbers = frozenset((record.first + new + np.flatnonzero(wild)).tolist())

@@ -6,6 +6,7 @@ from math import sin
 
 import numpy as np
 import pytest
+from cases.held_up import HeldUpProcesses
 from cases.loops import motor
 from contract.figures import judged
 from contract.learning_rows import PAPER as EXACT
@@ -221,3 +222,12 @@ def test_where_the_play_began_does_not_contradict_readings_that_were_rounded() -
         'truth.scale_frequency': 0.8})
     record = build_closed_loop(p).run(900)
     assert (record.column('status')[200:] == Status.TRACKING).all()
+
+
+def test_a_driver_that_skips_commands_contradicts_for_a_moment_only() -> None:
+    p = Parameters({**motor(), 'estimator.use_applied_control': 'false'})
+    heard = HeldUpProcesses(p, 1.0, seed=3, reports=False).run(1.5)
+    states = [one.estimate.status for one in heard]
+    assert Status.INCONSISTENT in states
+    assert states[-1] is Status.TRACKING
+    assert heard[-1].error < 0.002

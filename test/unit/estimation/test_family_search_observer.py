@@ -7,6 +7,9 @@ from scipy.optimize import least_squares
 from scipy.signal import cont2discrete
 from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR
 
+from backlash_ros.core.estimate import Bounds
+from backlash_ros.core.estimation.explanations import Setup, afresh
+from backlash_ros.core.estimation.fit import Window
 from backlash_ros.core.estimation.observer import RATIOS, gain_of
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.posterior import independence, likelihood, mean_information
@@ -128,3 +131,20 @@ def test_gain_is_that_of_the_stationary_kalman_filter(name: str, ratio: float) -
     assert model.to_state @ found.gain == pytest.approx(gain, rel=1e-3, abs=1e-4 * max(abs(gain)))
     assert found.innovation**2 == pytest.approx(variance, rel=1e-3)
     assert found.cov == pytest.approx(cov, rel=1e-2, abs=1e-3 * np.trace(cov))
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_deviations_reach_as_far_along_the_gap_as_readings_leave_it_open(seed: int) -> None:
+    # But for one sample v has two values, so that slope and gap are told apart by that one.
+    b = [0.047093704, -0.111257106, 0.003570928, 0.031372878]
+    family = PlantFamily(TransferFunction(
+        b, [1.0, -3.571128462, 4.775346131, -2.833879626, 0.629725696]), 0.2)
+    v = np.array([-5.0] * 10 + [2.0] + [3.5] * 15 + [-5.0, 3.5, 3.5, -5.0, -5.0, 3.5] + [-5.0] * 33)
+    m, c_r, c_l = 0.92, 0.25, -1.2
+    noise = 0.06 * np.random.default_rng(seed).standard_normal(len(v))
+    y = lfilter(*family.at([0.0] * family.count), m * (play(v, c_r - c_l, -5.0 + c_r - c_l) - c_r))
+    setup = Setup(family, 0.06, Bounds(), 20.0, 5.4, 0.0, np.zeros(3))
+    found = afresh(setup, Window(0, v, y + noise, np.full(len(v), np.nan)))
+    assert found is not None
+    assert abs(found.gap - (c_r - c_l)) < 4.0 * found.gap_std
+    assert not setup.is_known(found)
