@@ -5,7 +5,7 @@ A section /AXIS/NODE holds values of one node of one axis; ** stands for all axe
 """
 
 import difflib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -45,9 +45,8 @@ class Configuration(NamedTuple):
 
     def parameters(self, axis: str = '') -> Parameters:
         """Of a loop, maybe that of a joint: defaults, the file, --set, --seed."""
-        if self.joints and axis not in self.joints:
-            raise InputError(f'{self.path}: holds the joints {", ".join(self.joints)} of one '
-                             f'controller: choose one of them, like --axis {self.joints[0]}')
+        if self.joints:
+            _check_axis(self.path, axis, self.joints)
         return self.of_controller('' if self.joints else axis).of_joint(axis)
 
     def of_controller(self, axis: str = '') -> Parameters:
@@ -65,11 +64,7 @@ class Configuration(NamedTuple):
 
     def given(self, axis: str = '') -> dict[str, Value]:
         """Values of the file for an axis, by flat name."""
-        if self.axes and not axis:
-            raise InputError(f'{self.path}: holds the axes {", ".join(self.axes)} and only one can '
-                             f'be used here: choose it, like --axis {self.axes[0]}')
-        if axis and axis not in self.axes:
-            raise InputError(_no_such_axis(axis, self.axes))
+        _check_axis(self.path, axis, self.axes)
         values: dict[str, Value] = {}
         for equals in _sections_for(axis):
             found: dict[str, Value] = {}
@@ -117,8 +112,8 @@ def read_configuration(
         error.args = (f'{path}: {error}',)
         raise
     for axis, name, _ in parsed:
-        if axis and axis not in (axes or joints):
-            raise InputError(f'--set {axis}/{name}: {_no_such_axis(axis, axes or joints)}')
+        if axis:
+            _check_axis(f'--set {axis}/{name}', axis, axes or joints)
     return Configuration(path, checked, parsed, seed, axes, () if axes else joints)
 
 
@@ -143,10 +138,11 @@ def parse_setting(text: str) -> tuple[str, str, Value]:
     return axis, name, check_value(BY_NAME[name], value)
 
 
-def _no_such_axis(axis: str, axes: Sequence[str]) -> str:
-    known = f' among {", ".join(axes)}' if axes else \
-        f': list it in the parameter axes under /{BRINGUP}'
-    return f'there is no axis {axis!r}{known}'
+def _check_axis(where: object, axis: str, known: Sequence[str]) -> None:
+    if axis not in (known or ('',)):
+        rule = f'be one of {", ".join(known)}: choose it with --axis' if known else \
+            f'stand in the parameter axes, under /{BRINGUP}'
+        raise InputError(f'{where}: axis={axis!r} must {rule}')
 
 
 class _StrictLoader(yaml.SafeLoader):
@@ -205,23 +201,17 @@ def config_text(parameters: Parameters) -> str:
     """Content of that file, without empty lists, which ROS 2 does not have."""
     common = [p for p in BY_NAME.values() if parameters[p.name] != ()
               and (p.used_by != (BRINGUP,) or parameters[p.name] != p.default)]
-    tree = _tree(parameters, (p.name for p in common))
+    values = {p.name: parameters[p.name] for p in common}
     for joint in parameters.joints:
-        of_joint = parameters.of_joint(joint)
-        tree[joint] = _tree(of_joint, (
-            p.name for p in common if CONTROLLER in p.used_by and not p.per_node
-            and of_joint[p.name] != parameters[p.name]))
-    return yaml.dump({f'/{ANY}': {'ros__parameters': tree}}, Dumper=_Dumper, sort_keys=False,
-                     width=1000)
-
-
-def _tree(parameters: Parameters, names: Iterable[str]) -> dict[str, Any]:
+        own = parameters.of_joint(joint)
+        values |= {f'{joint}.{p.name}': own[p.name] for p in common if CONTROLLER in p.used_by
+                   and not p.per_node and own[p.name] != parameters[p.name]}
     tree: dict[str, Any] = {}
-    for name in names:
+    for name, value in values.items():
         *groups, leaf = name.split('.')
         branch = tree
         for group in groups:
             branch = branch.setdefault(group, {})
-        value = parameters[name]
         branch[leaf] = list(value) if isinstance(value, tuple) else value
-    return tree
+    return yaml.dump({f'/{ANY}': {'ros__parameters': tree}}, Dumper=_Dumper, sort_keys=False,
+                     width=1000)

@@ -40,8 +40,8 @@ DRIVER = 'drive --axis {axis}'
     (['--driver', 'none', '--set', 'control.min=-5', '--set', 'control.max=5'], [
         'control.rate_max=inf', 'set control.rate_max, or']),
     (['--driver', "x 'y"], ['driver', 'is not a command', 'quotation']),
-    (['--axis', 'x'], ["no axis 'x'", 'axes', '/bringup']),
-    (['--set', 'x/seed=3'], ['x/seed', "no axis 'x'"]),
+    (['--axis', 'x'], ["axis='x' must stand", 'axes', '/bringup']),
+    (['--set', 'x/seed=3'], ['x/seed', "axis='x' must"]),
     (['--set', 'axes=[a, b]', '--set', 'b/backlash.c_l=4'], ['b: backlash.c_l=4.0', '<']),
     (['--set', 'axes=[a, b]', '--set', 'estimates.file=e'], ["'e'", 'of a and of b']),
     (['--set', 'axes=[a, b, c, d, e, f, g, h]'], ['8 axes', 'at most 7']),

@@ -55,7 +55,7 @@ def test_of_an_arm_one_joint_is_chosen(config: Path) -> None:
       numerator: [0.5]}}, io: {style: joint_state_topic}}}""")
     assert effective_parameters(config, axis='waist')['control.rate_max'] == 1.0
     assert effective_parameters(config, axis='wrist')['control.rate_max'] == 2.0
-    with pytest.raises(InputError, match='holds the joints waist, wrist'):
+    with pytest.raises(InputError, match="axis='' must be one of waist, wrist"):
         effective_parameters(config)
     written(config, config.read_text().replace('numerator:', 'numerators:'))
     with pytest.raises(ParameterError, match=r'waist\.plant\.numerators is not a parameter'):
@@ -73,7 +73,7 @@ def test_values_of_joints_are_written_back_and_may_stand_apart_from_their_list(c
     again = read_configuration(copy).of_controller()
     for joint in ('waist', 'wrist'):
         assert again.of_joint(joint) == parameters.of_joint(joint)
-    with pytest.raises(InputError, match="no axis 'wist' among waist, wrist"):
+    with pytest.raises(InputError, match="axis='wist' must be one of waist, wrist"):
         read_configuration(config, ['wist/control.max=3'])
 
 
@@ -186,11 +186,11 @@ def test_section_that_no_axis_would_read_is_refused(config, section, message):
 
 def test_one_of_several_axes_must_be_chosen_by_its_name(config: Path) -> None:
     written(config, AXES)
-    with pytest.raises(InputError, match=r'holds the axes x, y .* like --axis x'):
+    with pytest.raises(InputError, match="axis='' must be one of x, y: choose it with --axis"):
         effective_parameters(config)
-    with pytest.raises(InputError, match="no axis 'z' among x, y"):
+    with pytest.raises(InputError, match="axis='z' must be one of x, y"):
         effective_parameters(config, axis='z')
-    with pytest.raises(InputError, match="--set z/seed: there is no axis 'z' among x, y"):
+    with pytest.raises(InputError, match="--set z/seed: axis='z' must be one of x, y"):
         effective_parameters(config, ['z/seed=1'], axis='x')
 
 
