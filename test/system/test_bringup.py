@@ -250,7 +250,7 @@ def test_joints_of_an_arm_have_one_controller_and_a_report_each(start, tmp_path)
         '--driver', shlex.join([sys.executable, str(tmp_path / 'arm.py')]))
     assert session.wait() == 0, session.stderr
     assert session.survivors() == {}
-    assert 'waiting for whoever plans the motion, on robot_joint_command' in session.stdout
+    assert 'waiting for a plan of motion on robot_joint_command' in session.stdout
     for joint, c_r in (('waist', 0.02), ('elbow', 0.05)):
         assert (session.out / joint / 'report.html').is_file()
         summary = json.loads((session.out / joint / 'summary.json').read_text())

@@ -28,12 +28,12 @@ from backlash_ros.tools.cli import ONE_THREAD, BrokenOffError
 ESCALATION = ((signal.SIGINT, 10.0), (signal.SIGTERM, 3.0), (signal.SIGKILL, 3.0))
 
 
-def child_environment(log_folder: Path, domain: int | None) -> dict[str, str]:
-    """Environment of nodes on this machine; what the user has set stays, the domain if None."""
+def child_environment(log_folder: Path, domain: int | str) -> dict[str, str]:
+    """Environment of nodes on this machine; what the user has set stays, except for the domain."""
     environment = {
         'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', 'ROS_LOG_DIR': str(log_folder / 'ros'),
         **ONE_THREAD, **with_source(os.environ), 'BACKLASH_ROS_EVENTS': '1',
-        'PYTHONUNBUFFERED': '1', **({'ROS_DOMAIN_ID': str(domain)} if domain is not None else {})}
+        'PYTHONUNBUFFERED': '1', 'ROS_DOMAIN_ID': str(domain)}
     prefer_loopback(environment)  # for drivers; the nodes of this package do so themselves
     return environment
 

@@ -84,23 +84,21 @@ def run(axes: Sequence[Axis], record: bool, live_port: int | None) -> str:
     Raises BrokenOffError where nothing can start.
     """
     name = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
-    discovery = f'{name}={os.environ.get(name, "LOCALHOST")}'
-    domain = None
+    domain: int | str = os.environ.get('ROS_DOMAIN_ID', '')
     with StopRequests() as requests, ExitStack() as stack:
-        if any(axis.parameters.driver == ELSEWHERE for axis in axes):
-            # Whoever started the driver did so in the domain that is set there, or in none.
-            print('waiting for the driver as long as it takes: start it with ROS_DOMAIN_ID='
-                  f'{os.environ.get("ROS_DOMAIN_ID") or 0} {discovery}')
-        elif not os.environ.get('ROS_DOMAIN_ID'):
-            domain = stack.enter_context(free_domain())
-            print(f'to listen in: export ROS_DOMAIN_ID={domain} {discovery}')
+        # Whoever started a driver did so in the domain that is set there, or in none.
+        elsewhere = any(axis.parameters.driver == ELSEWHERE for axis in axes)
+        domain = domain or (0 if elsewhere else stack.enter_context(free_domain()))
+        print(f'to listen in: export ROS_DOMAIN_ID={domain} '
+              f'{name}={os.environ.get(name, "LOCALHOST")}')
         for axis in axes:
-            if not axis.parameters.autostart:
-                print(f'waiting until somebody activates {axis.process_name("controller")} '
-                      '(autostart: false)')
-            if axis.parameters.joints:
-                print('waiting for whoever plans the motion, on '
-                      f'{axis.process_name(topics.ROBOT_COMMAND)}')
+            p = axis.parameters
+            if p.driver == ELSEWHERE:
+                print('waiting for the driver, which has to be in that domain')
+            if not p.autostart:
+                print(f'waiting for the activation of {axis.process_name("controller")}')
+            if p.joints:
+                print(f'waiting for a plan of motion on {axis.process_name(topics.ROBOT_COMMAND)}')
         sys.stdout.flush()
         supervisor = stack.enter_context(ProcessSupervisor(
             plan_processes(axes, record, live_port), child_environment(axes[0].logs, domain),

@@ -58,7 +58,7 @@ def watch(
         stages = [
             [Child(name, (sys.executable, '-c', program), axis.logs / f'{name}.log', axis)]
             for name, program in programs.items()]
-        environment = child_environment(axis.logs, None)
+        environment = child_environment(axis.logs, 0)
         with ProcessSupervisor(stages, environment, lambda: hurry) as supervisor:
             failure = execute([axis], supervisor, StopRequests())
         return Watched(failure, capsys.readouterr().err, mark)
@@ -101,7 +101,7 @@ def test_stages_end_one_after_the_other_each_with_the_time_that_it_needs(tmp_pat
     stages = [
         [Child(str(i), (sys.executable, '-c', program), tmp_path / f'{i}.log', foreign=True)]
         for i, program in enumerate((patient, after, deaf))]
-    environment = child_environment(tmp_path, None)
+    environment = child_environment(tmp_path, 0)
     with ProcessSupervisor(stages, environment, pause_s=0.3, grace_s=1.0) as supervisor:
         wait_until(lambda: all(file.exists() for file in files), 'all programs have begun')
         supervisor.stop()

@@ -76,10 +76,8 @@ def test_folder_that_holds_a_bag_is_not_written_over(tmp_path, capsys):
 
 def test_what_the_user_has_set_reaches_the_nodes(tmp_path, monkeypatch):
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'SUBNET')
-    monkeypatch.setenv('ROS_DOMAIN_ID', '7')
-    environment = child_environment(tmp_path, None)
+    environment = child_environment(tmp_path, 7)
     assert environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'SUBNET'
-    assert environment['ROS_DOMAIN_ID'] == '7'
     monkeypatch.delenv('ROS_AUTOMATIC_DISCOVERY_RANGE')
     environment = child_environment(tmp_path, 9)
     assert environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'LOCALHOST'
