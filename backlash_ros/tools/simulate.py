@@ -36,11 +36,9 @@ def make_parser() -> argparse.ArgumentParser:
 def _simulate(args: Sequence[str] | None) -> None:
     options = make_parser().parse_args(args)
     parameters = effective_parameters(options.config, options.settings, options.seed, options.axis)
-    many = options.seeds is not None or options.sweep
     if options.seeds is not None and options.seeds < 1:
         raise InputError(f'--seeds={options.seeds} must be >= 1')
-    if options.cluster is not None and not many:
-        raise InputError('--cluster does many runs: give --seeds or --sweep as well')
+    many = options.seeds is not None or options.sweep or options.cluster is not None
     (_many if many else _once)(parameters, options)
 
 

@@ -97,7 +97,6 @@ def test_sweep_runs_every_combination_for_every_seed(tmp_path: Path) -> None:
     (['--sweep', 'seed'], 'must be KEY=v1,v2,...'),
     (['--sweep', 'seed=1', '--sweep', 'seed=2'], 'names seed twice'),
     (['--sweep', 'backlash.m=1,-1'], 'backlash.m=-1.0 must be > 0'),
-    (['--cluster', 'tcp://x:1'], 'give --seeds or --sweep as well'),
     (['--nonsense'], 'unrecognized arguments: --nonsense'),
 ])
 def test_bad_input_is_one_line_and_leaves_nothing(
