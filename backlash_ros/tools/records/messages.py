@@ -143,11 +143,11 @@ def _signals(path: Path) -> tuple[dict[str, Signal], str]:
 
     recorded, _, damage = read_topics(path, lambda topic: topic.message_type in numbers_of and (
         topic.message_type != array or is_command(topic.name)))
-    series: dict[tuple[str, bool, str], list[tuple[int, float]]] = {}
+    signals = dict[str, Signal]()
     for topic, messages in sorted(recorded.items()):
         for stamp, message in messages:
             for part, joint, value in numbers_of[message.__msgtype__](message):
-                signal = topic.removeprefix('/') + part, is_command(topic), joint
-                series.setdefault(signal, []).append((stamp, float(value)))
-    return {name: Signal(pairs, commanded, joint)
-            for (name, commanded, joint), pairs in series.items()}, damage
+                signal = signals.setdefault(
+                    topic.removeprefix('/') + part, Signal([], is_command(topic), joint))
+                signal.messages.append((stamp, float(value)))
+    return signals, damage

@@ -11,9 +11,10 @@ import gzip
 import re
 import zlib
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from datetime import date
-from itertools import chain
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from datetime import datetime
+from itertools import chain, compress
 from math import nan
 from pathlib import Path
 from typing import NamedTuple
@@ -25,6 +26,14 @@ from backlash_ros.core.records.record import RecordError
 from backlash_ros.tools.records.columns import UNITS_S, columns_of, unit_of
 
 MOST_BROKEN = 0.1  # share of the lines that may be broken, and of the cells that are no number
+NO_NUMBER = {'', 'nan', 'null', 'none', 'na', 'n/a', '-', '--', 'nil', '?', '#n/a', 'bad',
+             'missing', 'nat'}
+COMMENT = re.compile(r'^\s*(?:[#%]|//)[#%/ \t]*')
+DATES = ('%Y-%m-%d', '%Y.%m.%d', '%d.%m.%Y', '%d.%m.%y', '%d-%b-%Y', '%d-%b-%y',
+         '%d-%B-%Y', '%m-%d-%Y', '%d-%m-%Y', '%m-%d-%y', '%d-%m-%y')
+DATE_AND_TIME = re.compile(
+    r'(\d+[-/. ]\w+[-/. ]\d+)?[t ,]*(?:(\d+:\d+(?::\d+)?(?:[.,:]\d+)?) ?(?:([ap])\.?m\.?)?'
+    r'(?: ?Z| UTC|[+-]\d\d:?\d\d)?)?', re.IGNORECASE)
 
 
 class Table(NamedTuple):
@@ -36,29 +45,24 @@ class Table(NamedTuple):
 
     def times(self, name: str) -> tuple[Array, float | None]:
         """Stamps (N,), and their unit [s] where the file tells it; raises RecordError."""
-        # As the first ones are.
-        numeric = [_number(cell, self.comma) is not None for cell in self.columns[name][:60]]
-        if not sum(numeric) > 0.5 * len(numeric):
-            dates = times_of(self.columns[name])
-            if np.isfinite(dates).mean() > 0.5:
-                return dates, 1.0
+        dates = times_of(self.columns[name])
+        if np.isfinite(dates).mean() > 0.5:
+            return dates, 1.0
         t = self.numbers(name, 'time')
         if re.fullmatch('date|datum', name.lower()) and 2e4 < np.nan_to_num(t).max() < 1e5:
             return t, 86400.0  # of a table calculation
         for other in self.columns:
             # In two columns, as in headers of ROS messages.
-            if re.fullmatch(r'(.*)n(ano)?(secs?)', other) and re.sub(
-                    r'n(ano)?(secs?)$', r'\2', other).rstrip('s') == name.rstrip('s'):
+            whole, nanoseconds = re.subn('n(ano)?(?=secs?$)', '', other)
+            if nanoseconds and whole.rstrip('s') == name.rstrip('s'):
                 return t + 1e-9 * self.numbers(other), 1.0
         return t, unit_of(name)
 
     def numbers(self, name: str, what: str = 'number') -> Array:
         """A column as numbers (N,), nan where there is none; raises RecordError."""
-        unknown = {'', 'nan', 'null', 'none', 'na', 'n/a', '-', '--', 'nil', '?', '#n/a', 'bad',
-                   'missing', 'nat'}
         cells = self.columns[name]
         values = np.array([_number(cell, self.comma) for cell in cells], dtype=float)
-        broken = [k for k in np.flatnonzero(np.isnan(values)) if cells[k].lower() not in unknown]
+        broken = [k for k in np.flatnonzero(np.isnan(values)) if cells[k].lower() not in NO_NUMBER]
         if len(broken) > MOST_BROKEN * len(cells):
             raise RecordError(
                 f'column {name!r}: {cells[broken[0]]!r} in row {broken[0] + 1} is no {what}, as in '
@@ -94,43 +98,33 @@ def _number(cell: str, comma: bool) -> float | None:
 
 
 def times_of(cells: Sequence[str]) -> Array:
-    """Seconds (N,) of dates, or of times of day, all of one zone; nan for what is none.
+    """Seconds (N,) of dates, or of times of day, all of one zone; nan for what is none."""
+    found = [DATE_AND_TIME.fullmatch(cell) for cell in cells]
+    parts = [each.groups('') if each else ('', '', '') for each in found]
+    dates = [re.sub('[/ ]', '-', date) for date, _, _ in parts]
+    days = _days({*dates})
+    return np.array([
+        days.get(date, nan if date or not time else 0.0) + _time_of_day(time, half)
+        for date, (_, time, half) in zip(dates, parts, strict=True)])
 
-    Of 3/4/2024 what is the day is told by the whole column.
-    """
-    by_month, by_day = (np.array([_seconds(cell, day_first) for cell in cells])
-                        for day_first in (False, True))
-    known = [each[np.isfinite(each)] for each in (by_month, by_day)]
-    sizes = [(-len(each), np.ptp(each) if len(each) else 0.0) for each in known]
-    return by_day if sizes[1] < sizes[0] else by_month
+
+def _days(dates: Iterable[str]) -> Mapping[str, float]:
+    """Seconds from 1970 to each; of 3/4/2024 what is the day is told by all of them."""
+    found = [dict[str, float]() for _ in DATES]
+    for days, form in zip(found, DATES, strict=True):
+        for date in dates:
+            with suppress(ValueError):
+                days[date] = 86400.0 * (datetime.strptime(date, form).toordinal() - 719163)
+    return min(found, key=lambda days: (
+        -len(days), max(days.values(), default=0.0) - min(days.values(), default=0.0)))
 
 
-def _seconds(cell: str, day_first: bool) -> float:
-    months = ['jan', 'feb', 'mar', 'apr', 'may', 'jun', 'jul', 'aug', 'sep', 'oct', 'nov', 'dec']
-    text = re.sub(r'( ?Z| UTC|[+-]\d\d:?\d\d)$', '', cell.strip())
-    text = re.sub(r'^(\d{4})(\d\d)(\d\d)[T_ ](\d\d)(\d\d)(\d\d)', r'\1-\2-\3 \4:\5:\6', text)
-    # A date, a time of day, or both.
-    found = re.fullmatch(
-        r'(?:(\d{1,4})([-/. ])(\d{1,2}|[a-z]{3})[a-z]*[-/. ](\d{1,4}))?[t ,]*'
-        r'(?:(?:(\d{1,4}):)?(\d{1,2}):(\d{1,2}(?:[.,:]\d+)?)(?: ?([ap])\.?m\.?)?)?', text.lower())
-    if not text or found is None:
-        return nan
-    a, sign, b, c, hours, minutes, seconds, half = found.groups()
-    if hours is None and seconds is not None and seconds.isdigit():
-        hours, minutes, seconds = minutes, seconds, '0'  # 23:59, but 59:59.9
-    hour = int(hours or 0) % 12 + 12 * (half == 'p') if half else int(hours or 0)
-    time = 3600.0 * hour + 60.0 * int(minutes or 0) + float(re.sub('[,:]', '.', seconds or '0'))
-    if a is None:
-        return time
-    if b in months:
-        b, day_first = str(months.index(b) + 1), True
-    year, month, day = (a, b, c) if len(a) == 4 else \
-        (c, b, a) if day_first or sign == '.' else (c, a, b)
-    try:
-        days = date(int(year) + 2000 * (len(year) < 4), int(month), int(day)).toordinal()
-    except ValueError:
-        return nan
-    return 86400.0 * (days - 719163.0) + time  # since 1970
+def _time_of_day(time: str, half: str) -> float:
+    hours, minutes, *seconds = (time or '0:0').replace(',', '.').split(':')
+    if not seconds and '.' in minutes:  # 59:59.9
+        hours, minutes, seconds = '0', hours, [minutes]
+    hour = int(hours) % 12 + 12 * (half in 'pP') if half else int(hours)
+    return 3600.0 * hour + 60.0 * int(minutes) + float('.'.join(seconds) or '0')
 
 
 def read_table(path: Path) -> Table:
@@ -143,35 +137,30 @@ def read_table(path: Path) -> Table:
         raise RecordError(f'cannot be read: {error}') from None
     if data[:4] == b'PAR1':
         return _from_parquet(path).by_name()
-    wide = 'utf-16' if data[:2] in (b'\xff\xfe', b'\xfe\xff') else \
-        'utf-16-le' if b'\0' in data and not data[1:200:2].strip(b'\0') else ''
-    if b'\0' in data[:4096] and not wide:
-        raise RecordError('is no text: give a CSV, a Parquet file, or the folder of a bag')
     try:
-        text = data.decode(wide or 'utf-8-sig')
+        text = data.decode('utf-16' if data[:2] in (b'\xff\xfe', b'\xfe\xff') else 'utf-8-sig')
     except UnicodeDecodeError:
         text = data.decode('latin-1')
+    if '\0' in text:
+        raise RecordError('is no text: give a CSV, a Parquet file, or the folder of a bag')
     return _from_text(text).by_name()
 
 
 def _from_text(text: str) -> Table:
-    comment = re.compile(r'\s*(?:[#%]|//)[#%/ \t]*')
-    lines = [line for line in text.replace('\0', '').replace('−', '-').splitlines()
-             if line.strip()]
-    bare = [line for line in lines if not comment.match(line)]
-    separator, count = _separator(bare)
-    rows = [_split(line, separator) for line in bare]
+    lines = [line for line in text.replace('−', '-').splitlines() if line.strip()]
+    bare = [not COMMENT.match(line) for line in lines]
+    separator, count = _separator([*compress(lines, bare)])
+    rows = [_split(COMMENT.sub('', line), separator) for line in lines]
     # A last row may be torn; trailing separators may be missing.
-    data = [abs(len(row) - count) <= 1 and _is_numeric(row) for row in rows]
+    data = [own and abs(len(row) - count) <= 1 and _is_numeric(row)
+            for own, row in zip(bare, rows, strict=True)]
     if not count or not any(data):
         raise RecordError(
             'holds no table: give rows of numbers with t, v and y, separated by , ; or tabs')
-    # From the middle of the file upwards: a table may stand below other ones.
-    first = min(np.flatnonzero(data).tolist(), key=lambda k: abs(k - len(rows) // 2))
+    # From the middle upwards: a table may stand below other ones.
+    first = np.flatnonzero(data)[sum(data) // 2]
     wide = max(2, sum(map(bool, rows[first])) - 1)
-    commented = [_split(comment.sub('', line, 1), separator)
-                 for line in lines[:lines.index(bare[first])] if comment.match(line)]
-    heads = [row for row in (*commented, *rows[:first])
+    heads = [row for row in rows[:first]
              if sum(map(bool, row)) >= wide and not _is_numeric(row)] or [[]]
     head, units = heads[-1], list[str]()
     # A head that comes again belongs to the same table.
@@ -185,7 +174,7 @@ def _from_text(text: str) -> Table:
              for k, name in enumerate(names)]
     names = [f'{name} [{unit.strip("[]() ")}]' if unit else name
              for name, unit in zip(names, [*units, *empty], strict=False)]
-    below = [k for k in range(at + 1, len(rows)) if rows[k] not in (head, units)]
+    below = [k for k in range(at + 1, len(rows)) if bare[k] and rows[k] not in (head, units)]
     body = [[*rows[k], *empty][:count] for k in below if data[k]]
     skipped = len(below) - len(body)
     if skipped > max(MOST_BROKEN * len(body), 3.0):
@@ -202,15 +191,13 @@ def _is_numeric(row: Sequence[str]) -> bool:
 
 
 def _split(line: str, separator: str) -> list[str]:
-    line = line.strip(' \r')
     if separator == ' ':
         return line.split()
-    if '"' not in line:
-        return [cell.strip() for cell in line.split(separator)]
     try:
-        return [cell.strip() for cell in next(csv.reader([line], delimiter=separator), [])]
+        cells = next(csv.reader([line.strip(' ')], delimiter=separator), [])
     except csv.Error:
         return []
+    return [cell.strip() for cell in cells]
 
 
 def _separator(lines: Sequence[str]) -> tuple[str, int]:

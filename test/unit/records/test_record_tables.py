@@ -103,7 +103,7 @@ def test_a_table_is_read_as_it_is(tmp_path: Path, name: str) -> None:
     assert (record.v.tolist(), record.y.tolist()) == (V.tolist(), Y.tolist())
 
 
-@pytest.mark.parametrize('encoding', ['utf-16', 'utf-16-le', 'utf-8-sig', 'latin-1'])
+@pytest.mark.parametrize('encoding', ['utf-16', 'utf-8-sig', 'latin-1'])
 def test_a_text_may_be_encoded_in_other_ways(tmp_path: Path, encoding: str) -> None:
     text = 't [µs],v,y\n' + rows('{ms}000,{v:.3f},{y:.3f}')
     path = written(tmp_path / 'a.csv', text, encoding)
