@@ -5,6 +5,7 @@ motion is predicted from its neighbours: what is left is noise, and wrong instan
 """
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.settings import GATE, OUTLIER_SHARE
@@ -185,19 +186,15 @@ def _residuals(t: Array, s: Array, reach: int) -> Array:
     """Error of predicting each value from `reach` neighbours on each side, per unit of noise."""
     if len(s) < FEWEST_VALUES:
         return np.empty(0)
-    t = t - t[0]
-    sides = [j for j in range(-reach, reach + 1) if j]
-    at = np.arange(reach, len(t) - reach)
+    times, values = (sliding_window_view(each, 2 * reach + 1) for each in (t - t[0], s))
     # Neighbours that are nearly at one place predict nothing.
-    apart = np.min([t[at + j + 1] - t[at + j] for j in range(-reach, reach)], axis=0)
-    at = at[apart > 0.05 * t[-1] / (len(t) - 1)]
-    predicted, variance = np.zeros(len(at)), np.ones(len(at))
-    for j in sides:
-        weight = np.prod(
-            [(t[at] - t[at + i]) / (t[at + j] - t[at + i]) for i in sides if i != j], axis=0)
-        predicted += weight * s[at + j]
-        variance += weight**2
-    return np.asarray((s[at] - predicted) / np.sqrt(variance))
+    apart = np.diff(times, axis=1).min(axis=1) > 0.05 * np.ptp(t) / (len(t) - 1)
+    times, values = times[apart], values[apart]
+    # Of the divided difference, which is 0 where all are equal.
+    weights = np.stack([1.0 / np.prod(times[:, [j]] - np.delete(times, j, axis=1), axis=1)
+                        for j in range(2 * reach + 1)], axis=1)
+    off = values - values[:, [reach]]
+    return np.asarray(np.sum(weights * off, axis=1) / np.linalg.norm(weights, axis=1))
 
 
 def noise_of(t: Array, y: Array) -> float:

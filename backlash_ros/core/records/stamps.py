@@ -1,6 +1,7 @@
 """Stamps of a log in seconds, and its rows in the order of time, without stamps that are none."""
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from backlash_ros.core.plant.transfer_function import Array
@@ -90,9 +91,9 @@ def in_order(t: Array, said: list[str], what: str = 'row') -> NDArray[np.intp]:
         said.append(f'the newest {what} stood first: turned around')
     # Far from the rows around, of which up to five in a row may be bad.
     size = min(11, len(rows) - 1 + len(rows) % 2)
-    around = np.lib.stride_tricks.sliding_window_view(
-        np.pad(t[rows], size // 2, 'reflect'), size)
-    bad = np.abs(t[rows] - np.median(around, axis=1)) > 50.0 * typical_step(t[rows])
+    around = np.median(
+        sliding_window_view(np.pad(t[rows], size // 2, 'reflect'), size), axis=1)
+    bad = np.abs(t[rows] - around) > 50.0 * typical_step(t[rows])
     refuse(int(bad.sum()), 0.1, 'jumps to and fro in')
     if bad.any():
         said.append(f'{count(int(bad.sum()))} with a stamp far off left out')
