@@ -23,7 +23,7 @@ FEWEST_MESSAGES = 3  # that are a motion
 class Signal(NamedTuple):
     """Numbers of one topic, or of one joint of it. commanded: v, by the name of the topic."""
 
-    messages: Messages
+    messages: list[tuple[int, float]]
     commanded: bool
     joint: str = ''
 
