@@ -1,6 +1,7 @@
 """Which sample of the plant a message holds, how many were skipped, and when a driver samples."""
 
 from collections import deque
+from collections.abc import Sequence
 from itertools import islice, pairwise
 from math import isfinite, nan, sqrt
 from typing import NamedTuple
@@ -138,7 +139,7 @@ class DriverPeriod:
             return Period()
         apart = 1 + len(times) // 300  # neighbours tell the same
         times = times[::apart]
-        numbers = np.array(_numbered(times.tolist(), typical))
+        numbers = np.array(numbered(times.tolist(), typical))
         n, t = numbers - numbers.mean(), times - times.mean()
         spread = float(n @ n)
         slope = float(n @ t) / spread if spread else nan
@@ -152,11 +153,14 @@ class DriverPeriod:
         return Period(slope, std, float(ordered[len(ordered) // 2]))
 
 
-def _numbered(times: list[float], period_s: float) -> list[float]:
-    """The number of each sample: stamps come late, by less than a period, but hardly early."""
+def numbered(times: Sequence[float], period_s: float, early: float = 0.3) -> list[float]:
+    """The number of each sample: stamps come late, by less than a period, but hardly early.
+
+    early: share of a period by which one may come before it is due.
+    """
     number, numbers, due = 0.0, [0.0], times[0]
     for time in times[1:]:
-        passed = max(int((time - due) / period_s + 0.3), 0)
+        passed = max(int((time - due) / period_s + early), 0)
         number += passed
         numbers.append(number)
         late = time - due - passed * period_s

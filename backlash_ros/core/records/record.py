@@ -18,6 +18,11 @@ def seconds(time_s: float) -> str:
     return f'{time_s * 1e3:.4g} ms' if time_s < 0.1 else f'{time_s:.4g} s'
 
 
+def counted(number: int, of: str) -> str:
+    """How many there are, for people."""
+    return f'{number} {of}{"" if number == 1 else "s"}'
+
+
 @dataclass(frozen=True)
 class Record:
     """One motion on a uniform grid of sample_period [s], N samples.

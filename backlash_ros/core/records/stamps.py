@@ -5,7 +5,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from backlash_ros.core.plant.transfer_function import Array
-from backlash_ros.core.records.record import RecordError, seconds
+from backlash_ros.core.records.record import RecordError, counted, seconds
 
 
 def in_seconds(
@@ -72,19 +72,9 @@ def typical_step(t: Array) -> float:
 def in_order(t: Array, said: list[str], what: str = 'row') -> NDArray[np.intp]:
     """Rows of the stamps t (N,) [s] that are kept, by time; raises RecordError where they make no
     sense. what: name of a row."""
-    def count(number: int, of: str = what) -> str:
-        return f'{number} {of}{"" if number == 1 else "s"}'
-
-    def refuse(wrong: int, most: float, why: str) -> None:
-        if wrong > most * len(rows):
-            raise RecordError(f't {why} {wrong} of {len(rows)} {what}s: choose another column for '
-                              't with --columns, or leave t out and give --period S')
-
     rows = np.flatnonzero(np.isfinite(t))
     if len(rows) < len(t):
-        said.append(f'{count(len(t) - len(rows))} without a time left out')
-    if len(rows) < 2:
-        raise RecordError(f'holds {count(len(rows))} with a time, which is no motion')
+        said.append(f'{counted(len(t) - len(rows), what)} without a time left out')
     steps = np.diff(t[rows])
     if np.count_nonzero(steps < 0.0) > np.count_nonzero(steps > 0.0):
         rows = rows[::-1]
@@ -94,24 +84,24 @@ def in_order(t: Array, said: list[str], what: str = 'row') -> NDArray[np.intp]:
     around = np.median(
         sliding_window_view(np.pad(t[rows], size // 2, 'reflect'), size), axis=1)
     bad = np.abs(t[rows] - around) > 50.0 * typical_step(t[rows])
-    refuse(int(bad.sum()), 0.1, 'jumps to and fro in')
-    if bad.any():
-        said.append(f'{count(int(bad.sum()))} with a stamp far off left out')
-        rows = rows[~bad]
     # A clock that began anew falls back by several periods; less is disorder.
-    parts = np.split(rows, np.flatnonzero(np.diff(t[rows]) < -3.0 * typical_step(t[rows])) + 1)
+    sound = rows[~bad]
+    parts = np.split(sound, np.flatnonzero(np.diff(t[sound]) < -3.0 * typical_step(t[sound])) + 1)
     longest = max(parts, key=len)
-    refuse(len(rows) - len(longest), 0.8, 'falls back and leaves out')
+    moved = np.count_nonzero(np.diff(t[longest]) < 0.0)
+    if bad.sum() > 0.1 * len(rows) or len(longest) < 0.2 * len(sound) or moved > 0.2 * len(longest):
+        raise RecordError(
+            f't jumps to and fro in {bad.sum()} of {counted(len(rows), what)}, falls back in '
+            f'{len(parts) - 1 + moved}: choose another column for t with --columns, or leave t '
+            'out and give --period S')
+    if bad.any():
+        said.append(f'{counted(bad.sum(), what)} with a stamp far off left out')
     if len(parts) > 1:
-        rows = longest
-        said.append(f't begins anew {count(len(parts) - 1, "time")}: the longest of {len(parts)} '
-                    f'parts, {len(rows)} {what}s, is used')
-    moved = int(np.count_nonzero(np.diff(t[rows]) < 0.0))
-    refuse(moved, 0.2, 'falls back in')
+        said.append(f't begins anew {counted(len(parts) - 1, "time")}: the longest of {len(parts)} '
+                    f'parts, {counted(len(longest), what)}, is used')
     if moved:
-        rows = rows[np.argsort(t[rows], kind='stable')]
-        said.append(f'{count(moved)} out of order sorted by time')
-    return rows
+        said.append(f'{counted(moved, what)} out of order sorted by time')
+    return longest[np.argsort(t[longest], kind='stable')]
 
 
 def spread_evenly(t: Array, said: list[str], *signals: Array) -> Array:

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.control.limits import LARGEST_SIGNAL
 from backlash_ros.core.loop.command_history import v_of_intervals
-from backlash_ros.core.loop.sample_counter import CLOCK_SLACK, JITTER
+from backlash_ros.core.loop.sample_counter import JITTER, numbered
 from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.records import readings, stamps
-from backlash_ros.core.records.record import Record, RecordError, seconds
+from backlash_ros.core.records.record import Record, RecordError, counted, seconds
 
 Numbers = NDArray[np.int64]
 
@@ -154,8 +154,8 @@ def on_grid(rows: Rows, period: float | None = None, late: bool = False) -> Reco
     nearly_even = 0.02  # of a period that stamps of even samples may be off
     guess = period or (stamps.typical_step(rows.t) if late else _period(rows.t))
     rows, cut = _longest_stretch(rows, guess)
-    if not np.isfinite(rows.y).any():
-        raise RecordError(f'{cut}but y holds no number there: cut out one motion with --from, --to')
+    if len(rows.t) < 2 or not np.isfinite(rows.y).any():
+        raise RecordError(f'{cut}but y holds no motion there: cut out one with --from, --to')
     steps = np.diff(rows.t) / guess
     found = _numbering(rows.t, steps, guess, late)
     used = period or found.period
@@ -165,27 +165,23 @@ def on_grid(rows: Rows, period: float | None = None, late: bool = False) -> Reco
         return _numbered_grid(rows, found.numbers, used,
                               f'{cut}{len(rows.t)} {what}, one every {seconds(used)}')
     inner = steps[steps <= BREAK * max(float(np.median(steps)), 1.0)]
-    jitter = 0.5 * float(np.ptp(np.percentile(inner, [16.0, 84.0])))
-    # A few odd ones among even stamps are told as well.
-    percent = f'{100.0 * (jitter if jitter > 0.005 else float(np.std(inner))):.2g} %'
+    mean = float(np.mean(inner))
+    come = f'{cut}stamps come every {seconds(mean * guess)} ± {np.std(inner) / mean:.2%}'
     if period is not None:
-        found = _along(_numbered(rows.t / period), rows.t)
+        found = _along(_late_numbers(rows.t / period), rows.t)
     # Too many may be missing, or too late, to be numbered.
     if found.numbers[-1] + 1 <= 1.3 * len(rows.t) and np.std(found.off) <= found.period and sum(
             readings.rougher(rows.t, found.numbers.astype(float), signal)
             for signal in (rows.y, rows.v) if signal.ndim == 1) > 0.05:
-        return _numbered_grid(
-            rows, found.numbers, used, f'{cut}stamps are uneven by {percent} of {seconds(used)}, '
-            'the motion is not: rows are numbered')
+        return _numbered_grid(rows, found.numbers, used, f'{come}, the motion is even: rows are '
+                              f'numbered, one every {seconds(used)}')
     begin = float(rows.t[0])
     if period is None and np.abs(found.off).max() <= 0.5 * used:
         begin = found.begin
     else:
         used = guess
-    how = f'jitter by {percent} around {seconds(used)}'
-    if jitter <= 1e-3 and period is not None:
-        how = f'come every {seconds(_period(rows.t))}, for samples of {seconds(used)}'
-    return _true_instants(rows, begin, used, f'{cut}stamps {how}: v and y are taken at them')
+    return _true_instants(rows, begin, used, f'{come}: v and y are taken at them, for samples of '
+                          f'{seconds(used)}')
 
 
 def _period(t: Array) -> float:
@@ -213,8 +209,8 @@ def _longest_stretch(rows: Rows, period: float) -> tuple[Rows, str]:
     kept: dict[str, Any] = {name: values[part] for name, values in rows._asdict().items()
                             if np.ndim(values) == 1}
     cut = rows._replace(**kept)
-    gaps = f'{len(ends) - 2} long gap{"s" * (len(ends) > 3)}'
-    return cut, f'{gaps}: the longest stretch, {len(cut.t)} rows, is used; '
+    return cut, (f'{counted(len(ends) - 2, "long gap")}: the longest stretch, {len(cut.t)} rows, '
+                 'is used; ')
 
 
 def _along(numbers: Numbers, t: Array) -> Numbering:
@@ -224,13 +220,13 @@ def _along(numbers: Numbers, t: Array) -> Numbering:
 
 def _numbering(t: Array, steps: Array, period: float, late: bool) -> Numbering:
     """The one that lies closest to a line. steps (M - 1,): in periods."""
-    found = [_along(_numbered(t / period), t)]
+    found = [_along(_late_numbers(t / period), t)]
     if not late:
         # The median of uneven steps is off by more than a long record bears.
         usual = steps[steps < 0.5 * BREAK]
         mean = period * (float(np.mean(usual)) if usual.any() else 1.0)
         found += [_along(numbers, t) for numbers in (
-            _risen(np.append(0.0, np.cumsum(np.round(steps)))), _numbered(t / mean),
+            _risen(np.append(0.0, np.cumsum(np.round(steps)))), _late_numbers(t / mean),
             _risen(np.round((t - t[0]) / period)))]
         # Around the line that all of them tell, as far as they are late by less than a period.
         found += [_along(_risen(np.round((t - one.begin) / one.period)), t)
@@ -243,16 +239,9 @@ def _numbering(t: Array, steps: Array, period: float, late: bool) -> Numbering:
     return best._replace(period=stamps.fewest_digits(best.period, deviation))
 
 
-def _numbered(times: Array) -> Numbers:
-    """From times [periods], late, never early: what comes before the next one is due is still the
-    sample before, and of those that come in a heap the last one is the newest."""
-    begin, number = float(times[0]), 0
-    passed = np.zeros(len(times))
-    for i, time in enumerate(times.tolist()):
-        newest = max(int(time - begin + 1.0 - JITTER), number)
-        begin = min(begin + CLOCK_SLACK * (newest - number), time - newest)
-        passed[i] = number = newest
-    return _risen(passed)
+def _late_numbers(times: Array) -> Numbers:
+    """From times [periods], late, never early; of those that come in a heap the last is newest."""
+    return _risen(np.array(numbered(times.tolist(), 1.0, 1.0 - JITTER)))
 
 
 def _risen(numbers: Array) -> Numbers:

@@ -43,7 +43,8 @@ def read_bag_record(
     native = any(topic_ends_like(name, topics.PLANT_OUTPUT) for name in signals)
     if columns or (of_joints and not native):
         v, y = _joint_pair(signals, axis, columns)
-        heard = {topics.CONTROL: signals[v].messages, topics.PLANT_OUTPUT: signals[y].messages}
+        heard: dict[str, Messages] = {
+            topics.CONTROL: signals[v].messages, topics.PLANT_OUTPUT: signals[y].messages}
         note, of_axis = f'v is {v}, y is {y}', ''
     else:
         heard, note = _native(signals, axis)

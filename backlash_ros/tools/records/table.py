@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from backlash_ros.core.plant.transfer_function import Array
-from backlash_ros.core.records.record import RecordError
+from backlash_ros.core.records.record import RecordError, counted
 from backlash_ros.tools.records.columns import UNITS_S, columns_of, unit_of
 
 MOST_BROKEN = 0.1  # share of the lines that may be broken, and of the cells that are no number
@@ -181,7 +181,7 @@ def _from_text(text: str) -> Table:
         raise RecordError(f'{skipped} of {skipped + len(body)} lines are no rows of its table: '
                           f'{columns_of(names)}; leave one table with t, v and y')
     comma, point = (sum(sign in cell for cell in chain(*body)) for sign in ',.')
-    notes = (f'{skipped} broken line{"s" if skipped > 1 else ""} left out',) if skipped else ()
+    notes = (f'{counted(skipped, "broken line")} left out',) if skipped else ()
     cells = zip(*body, strict=True)
     return Table(dict(zip(names, cells, strict=True)), comma > point, notes)
 
