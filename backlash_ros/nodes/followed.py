@@ -99,6 +99,7 @@ class ViewerNode(ProcessNode):
     """
 
     def __init__(self, name: str, wanted: Sequence[str], labels: Sequence[str], depth: int) -> None:
+        give_way()
         super().__init__(name)
         self._labels, self._depth = labels, depth
         self._wanted = tuple(f'/{each.strip("/")}/'.replace('//', '/') for each in wanted) or '/'

@@ -16,7 +16,7 @@ from pathlib import Path
 from threading import Thread
 from typing import Any
 
-from backlash_ros.nodes.followed import ControllerState, ViewerNode, give_way, viewer_options
+from backlash_ros.nodes.followed import ControllerState, ViewerNode, viewer_options
 from backlash_ros.nodes.runtime.executor import PromptExecutor
 from backlash_ros.nodes.runtime.process import ENABLED, emit, run, split_arguments
 from backlash_ros.options import port
@@ -140,7 +140,6 @@ def main(args: list[str] | None = None) -> int:
         server = PageServer(options.port, shown_s=10.0)
     except OSError as error:
         parser.error(f'--port={options.port}: {error.strerror}: choose another one, or none')
-    give_way()
     with server:
         return run('live', lambda: LiveNode(options.name, server), of_ros)
 

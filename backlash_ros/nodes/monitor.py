@@ -25,7 +25,7 @@ from rich.panel import Panel
 from rich.text import Text
 from std_srvs.srv import SetBool, Trigger
 
-from backlash_ros.nodes.followed import ControllerState, ViewerNode, give_way, viewer_options
+from backlash_ros.nodes.followed import ControllerState, ViewerNode, viewer_options
 from backlash_ros.nodes.runtime.executor import PromptExecutor
 from backlash_ros.nodes.runtime.process import run, split_arguments
 from backlash_ros.topics import BACKLASH
@@ -205,7 +205,6 @@ def main(args: list[str] | None = None) -> int:
         'monitor', __doc__, 'keys: f freezes or goes on learning, c compensates or not, r (twice) '
         'resets the estimates,\n      s saves them, Tab takes the next controller, q ends.',
     ).parse_args(plain)
-    give_way()
     return run('monitor', lambda: MonitorNode(options.name), of_ros)
 
 

@@ -39,14 +39,12 @@ class PlantNode(ProcessNode):
         self._held = HeldControl()  # times of arrival on the monotonic clock
         self._expecting = False  # no v has come since the newest output
         self._published: Counter[str] = Counter()  # what a recorder can have heard
-        self._outgoing = {
-            topic: self.create_publisher(Float64, topic, messages.DEPTH)
+        self._applied, self._output = (
+            self.create_publisher(Float64, topic, messages.DEPTH)
             for topic in (topics.APPLIED_CONTROL, topics.PLANT_OUTPUT)
-        }
+        )
         if p.lockstep:
-            self._outgoing[topics.CLOCK] = self.create_publisher(
-                Clock, topics.CLOCK, messages.KEPT_QOS
-            )
+            self._clock_ticks = self.create_publisher(Clock, topics.CLOCK, messages.KEPT_QOS)
         self._truth = messages.LabelledArrayPublisher(
             self, topics.of_node(topics.TRUTH), topics.TRUTH_LABELS
         )
@@ -59,11 +57,8 @@ class PlantNode(ProcessNode):
     def _is_heard(self) -> bool:
         """Whether enough listen; one of several is a recorder, which wants everything."""
         wanted = max(self.settings.wait_for_subscribers, int(self.settings.lockstep))
-        applied, output = (
-            self._outgoing[topic].get_subscription_count()
-            for topic in (topics.APPLIED_CONTROL, topics.PLANT_OUTPUT)
-        )
-        return output >= wanted and min(self._truth.listeners, applied) >= int(wanted > 1)
+        of_recorder = min(self._truth.listeners, self._applied.get_subscription_count())
+        return self._output.get_subscription_count() >= wanted and of_recorder >= int(wanted > 1)
 
     def check_change(self, p: Parameters) -> None:
         build_plant(p)
@@ -139,7 +134,7 @@ class PlantNode(ProcessNode):
         """Let v act over a period; returns the row of the truth of it."""
         plant, sample = self._plant, self._plant.sample
         u, truth = plant.step(v), plant.backlash
-        self._outgoing[topics.APPLIED_CONTROL].publish(messages.message_with(plant.applied))
+        self._applied.publish(messages.message_with(plant.applied))
         return u, truth.m, truth.c_r, truth.c_l, v, float(sample)
 
     def _publish_output(self, latest_ns: float = inf) -> bool:
@@ -152,8 +147,8 @@ class PlantNode(ProcessNode):
         self._expecting = True
         if p.lockstep:
             now = Time(nanoseconds=round(sample * p.sample_period * 1e9))
-            self._outgoing[topics.CLOCK].publish(Clock(clock=now.to_msg()))
-        self._outgoing[topics.PLANT_OUTPUT].publish(messages.message_with(y))
+            self._clock_ticks.publish(Clock(clock=now.to_msg()))
+        self._output.publish(messages.message_with(y))
         self._published[topics.PLANT_OUTPUT] += 1
         self._published['samples'] = sample + 1
         return True
