@@ -16,12 +16,12 @@ from backlash_ros.core.assembly import build_model
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation import run_record
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
+from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.options import OptionParser
 from backlash_ros.tools import cli
 from backlash_ros.tools.config import effective_parameters
 from backlash_ros.tools.runs.files import result_directory
 from backlash_ros.tools.runs.read_run import run_loop
-from backlash_ros.tools.runs.summary import ErrorCurves, moving_rms
 from backlash_ros.topics import BACKLASH
 
 COMPARISON_HEADER = (
@@ -33,11 +33,15 @@ GAPLESS = {'backlash.c_r': 1e-9, 'backlash.c_l': -1e-9}
 
 
 class Result(NamedTuple):
-    """What became of a loop, as the table has it. note: why the run broke off."""
+    """What became of a loop; merits: as the table has them. note: why the run broke off.
+
+    delay: samples by which y is to follow y_m late, None where it is not to.
+    """
 
     name: str
     merits: tuple[float | None, ...] = (None,) * (len(COMPARISON_HEADER) - 1)
-    curves: ErrorCurves | None = None
+    run: RunRecord | None = None
+    delay: int | None = None
     note: str = ''
 
 
@@ -79,16 +83,14 @@ def compare(scenario: Parameters, samples: int) -> list[Result]:
 
 def _measure(name: str, p: Parameters, samples: int) -> Result:
     loop = build_closed_loop(p)
-    delay = loop.controller.structure.delay
+    delay = None if p.structure == 'proportional' else loop.controller.structure.delay
     try:
         run = run_loop(loop, samples)
     except cli.BrokenOffError as broken:
         return Result(name, note=str(broken))
-    t, since = run.column('t'), 0.2 * run.samples * run.sample_period
-    error = penalty = tracking = None
-    if p.structure != 'proportional':  # where y_m sets u_d
-        tracking = moving_rms(
-            run.column('y') - run_record.delayed_reference(run, delay), run.sample_period)
+    since = 0.2 * run.samples * run.sample_period
+    error = penalty = None
+    if delay is not None:
         gapless = run_loop(build_closed_loop(_fixed(
             p.replaced({**GAPLESS, 'fixed.doubt': 0.0}), p.backlash.m)), samples)
         error, best = (run_record.delayed_tracking_error_rms(each, delay, since)
@@ -96,9 +98,9 @@ def _measure(name: str, p: Parameters, samples: int) -> Result:
         penalty = None if error is None or best is None else error - best
     return Result(name, (
         run_record.control_error_rms(run), error, penalty,
-        run_record.total_variation(run.column('v')[t >= since]),
+        run_record.total_variation(run.column('v')[run.column('t') >= since]),
         run_record.gap_crossings_per_reversal(run, since),
-    ), ErrorCurves(name, t, moving_rms(run_record.control_error(run), run.sample_period), tracking))
+    ), run, delay)
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -117,8 +119,9 @@ def _compare(args: Sequence[str] | None) -> None:
     out = result_directory(options.out)
     figure, document = 'images/comparison.png', out / 'comparison.md'
     (out / figure).parent.mkdir(parents=True, exist_ok=True)
-    curves = [result.curves for result in results if result.curves is not None]
-    write_atomically(out / figure, png(draw_error_curves(curves)))
+    runs = {each.name: each.run for each in results if each.run is not None}
+    delays = {each.name: each.delay for each in results if each.delay is not None}
+    write_atomically(out / figure, png(draw_error_curves(runs, delays)))
     template = Template(Path(__file__).with_name('comparison.md').read_text(encoding='utf-8'))
     numbers = {name: f'{getattr(scenario.backlash, name):g}' for name in BACKLASH}
     write_atomically(document, template.substitute(

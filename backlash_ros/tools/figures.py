@@ -17,9 +17,10 @@ from backlash_ros.core.identification.identification import Details, Identificat
 from backlash_ros.core.identification.model import autocorrelation
 from backlash_ros.core.plant.backlash import Backlash
 from backlash_ros.core.plant.transfer_function import Array
-from backlash_ros.core.simulation.run_record import SETTLING_TOLERANCE, RunRecord, delayed_reference
+from backlash_ros.core.simulation import run_record
+from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.tools.cli import number
-from backlash_ros.tools.runs.summary import ERROR_WINDOW_S, ErrorCurves, Part
+from backlash_ros.tools.runs.summary import ERROR_WINDOW_S, Part, moving_rms
 from backlash_ros.topics import BACKLASH
 
 Line = tuple[Any, ...]  # what `curve` takes behind the axes: t, values, colour and further ones
@@ -129,7 +130,7 @@ def draw_parameter_errors(
     run: RunRecord, start: Part, settling: Mapping[str, float | None],
 ) -> Figure:
     """Errors of the estimates over time, as Figure 4 of the paper, and their relative size."""
-    t, tolerance = run.column('t'), 100.0 * SETTLING_TOLERANCE
+    t, tolerance = run.column('t'), 100.0 * run_record.SETTLING_TOLERANCE
     errors: list[Line] = []
     percents: list[Line] = []
     for name in BACKLASH:
@@ -217,7 +218,7 @@ def draw_hysteresis(run: RunRecord, end: Part) -> Figure:
 
 def draw_output(run: RunRecord, end: Part, delay: int, followed: bool) -> Figure:
     """Reference, `delay` samples late, and output: on one scale where y follows, else on two."""
-    t, y, y_m = run.column('t'), run.column('y'), delayed_reference(run, delay)
+    t, y, y_m = run.column('t'), run.column('y'), run_record.delayed_reference(run, delay)
     late = f', {delay * run.sample_period:.4g} s late' if delay else ''
     reference, output = (t, y_m, HUES['y_m']), (t, y, HUES['y'])
     figure, grid = draw_panels(5.6, {
@@ -242,18 +243,23 @@ def draw_input(run: RunRecord, parts: Sequence[Part]) -> Figure:
     return figure
 
 
-def draw_error_curves(loops: Sequence[ErrorCurves]) -> Figure:
-    """Moving RMS of the control errors (Figure 5 of the paper) and of any tracking errors."""
+def draw_error_curves(runs: Mapping[str, RunRecord], delays: Mapping[str, int] = {}) -> Figure:
+    """Moving RMS of the control errors (Figure 5 of the paper) and of tracking errors.
+
+    delays: samples by which y is to follow y_m late, of the runs in which it is to.
+    """
     colours = [HUES[name] for name in ('m', 'c_r', 'c_l', 'v', 'u_d', 'y', 'y_m', 'u')]
     rows: dict[str, list[Line]] = {}
-    for i, (name, t, *errors) in enumerate(loops):
+    for i, (name, run) in enumerate(runs.items()):
         # The curve of the loop without backlash comes to lie on that of the one that has learned.
         width = 3.4 if name == 'moving_horizon, tracking' else 1.7
         look = colours[i % 8], name, ('-', '--', '-.', ':')[i % 4], width
-        for error, what, unit in zip(errors, ('u - u_d', 'y - y_m'), 'uy', strict=True):
-            if error is not None:
-                row = f'RMS of ${what}$ over {ERROR_WINDOW_S} s\n[unit of {unit}]'
-                rows.setdefault(row, []).append((t, error, *look))
+        errors = {'u - u_d': run_record.control_error(run)}
+        if name in delays:
+            errors['y - y_m'] = run.column('y') - run_record.delayed_reference(run, delays[name])
+        for what, error in errors.items():
+            rows.setdefault(f'RMS of ${what}$ over {ERROR_WINDOW_S} s\n[unit of {what[0]}]', []) \
+                .append((run.column('t'), moving_rms(error, run.sample_period), *look))
     figure, grid = draw_panels(4.2 * len(rows), rows)
     titles = 'Control error', 'Tracking error, where y is meant to follow'
     for axes, lines, title in zip(grid[:, 0], rows.values(), titles, strict=False):

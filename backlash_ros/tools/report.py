@@ -62,7 +62,7 @@ def _figures(
         return
     start, end = parts = told.interesting_parts(run)
     truth, error, innovation = run.has_truth, control_error(run), run.column('innovation')
-    curves, notes = told.compare_laws(run, parameters) if truth and parameters else ([], [])
+    laws, notes = told.compare_laws(run, parameters) if truth and parameters else ({}, [])
     known = np.isfinite(error).any()
     duration = min(float(run.column('t')[-1]) + run.sample_period, 1e4 * run.sample_period)
     off = summary['tracking_error_rms']
@@ -80,10 +80,10 @@ def _figures(
         (not known and np.isfinite(innovation).any(), 'innovation', 'Innovation',
          'y minus its prediction. White and small: the model explains the plant.',
          figures.draw_closer, innovation, r'$y - \hat{y}$ [unit of y]', parts),
-        (curves, 'laws', 'Control error of the laws (Figure 5 of the paper)',
+        (laws, 'laws', 'Control error of the laws (Figure 5 of the paper)',
          'This run beside the other laws, simulated with the same parameters, over the first '
          f'{duration:.6g} s.' + ''.join(f' Without a curve: {escape(note)}.' for note in notes),
-         lambda _: figures.draw_error_curves(curves)),
+         lambda _: figures.draw_error_curves(laws)),
         (True, 'hysteresis', 'Backlash: the v–u loop',
          'u follows the right line going up, the left line going down, and is held between them. '
          'Where a dashed line lies on the wide one, the estimate is right.' if truth else

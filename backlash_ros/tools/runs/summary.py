@@ -13,7 +13,7 @@ from backlash_ros.core.parameters import ParameterError, Parameters
 from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.simulation import run_record
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
-from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord, control_error
+from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 from backlash_ros.tools.cli import NOTHING, BrokenOffError, InputError, format_table
 from backlash_ros.tools.runs.read_run import run_loop
 from backlash_ros.topics import BACKLASH
@@ -27,15 +27,6 @@ class Part(NamedTuple):
 
     name: str
     rows: slice
-
-
-class ErrorCurves(NamedTuple):
-    """Moving RMS of the errors of a loop, shape (N,); tracking: only where y is to follow."""
-
-    name: str
-    t: Array
-    control: Array
-    tracking: Array | None = None
 
 
 def summarise(
@@ -124,10 +115,10 @@ def moving_rms(values: Array, sample_period: float) -> Array:
     return np.where(count > 0.0, np.sqrt(squares / np.maximum(count, 1.0)), np.nan)
 
 
-def compare_laws(run: RunRecord, parameters: Parameters) -> tuple[list[ErrorCurves], list[str]]:
-    """The run's law beside every other one, simulated with the same parameters (Figure 5).
+def compare_laws(run: RunRecord, parameters: Parameters) -> tuple[dict[str, RunRecord], list[str]]:
+    """The run beside those of every other law, simulated with the same parameters (Figure 5).
 
-    Also what kept a law from its curve.
+    Also what kept a law from its run.
     """
     t, own, notes = run.column('t'), parameters.estimator.law, []
     samples = min(round(float(t[-1]) / run.sample_period) + 1, 10_000)
@@ -139,5 +130,4 @@ def compare_laws(run: RunRecord, parameters: Parameters) -> tuple[list[ErrorCurv
                 'estimator.law': law, 'estimates.load': False})), samples)
         except (ParameterError, InputError, BrokenOffError) as error:
             notes.append(f'{law}: {error}')
-    return [ErrorCurves(name, each.column('t'), moving_rms(control_error(each), run.sample_period))
-            for name, each in runs.items()], notes
+    return runs, notes

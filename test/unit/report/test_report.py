@@ -179,11 +179,11 @@ def test_moving_rms_is_that_of_the_newest_samples() -> None:
 
 def test_law_that_breaks_off_does_not_take_the_report_with_it(run: RunRecord) -> None:
     other = made_bags.PARAMETERS.replaced({'waveform': 'file', 'file': 'gone.csv'})
-    curves, notes = compare_laws(run, other)
-    assert [len(curve.t) for curve in curves] == [run.samples]
+    runs, notes = compare_laws(run, other)
+    assert [each.samples for each in runs.values()] == [run.samples]
     assert notes
     assert all('gone.csv' in note for note in notes)
-    assert isinstance(figures.draw_error_curves(curves), Figure)
+    assert isinstance(figures.draw_error_curves(runs), Figure)
 
 
 @pytest.mark.parametrize('storage', StoragePlugin)
