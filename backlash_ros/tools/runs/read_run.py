@@ -1,6 +1,5 @@
 """Runs from bags, joined on the number of the sample, from folders of results, from simulation."""
 
-from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -265,10 +264,9 @@ def _true_columns(signals: Table, truth: Table) -> dict[str, Array]:
     count, sample = signals['sample'], truth['sample']
     if not np.intersect1d(count, sample).size:
         # A controller that was started later counts from another beginning: the same v tells.
-        sample_of = dict(zip(truth['v'].tolist(), sample.tolist(), strict=True))
-        offsets = Counter(k - sample_of[v] for k, v in signals[['sample', 'v']].tolist()
-                          if v in sample_of)
-        sample = sample + (offsets.most_common(1) or [(0, 0)])[0][0]
+        _, here, there = np.intersect1d(signals['v'], truth['v'], return_indices=True)
+        if len(here):
+            sample = sample + np.quantile(count[here] - sample[there], 0.5, method='lower')
     _, here, there = np.intersect1d(count, sample, assume_unique=True, return_indices=True)
     u = np.full(len(count), np.nan)
     u[here] = truth['u'][there]

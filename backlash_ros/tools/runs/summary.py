@@ -39,20 +39,19 @@ def summarise(
     status = status[np.isfinite(status)]
     words = {float(state): state.word for state in Status}
     latency = np.empty(0) if latency_s is None else latency_s[np.isfinite(latency_s)]
-    began: dict[str, Any] = {name: float(run.column(name)[0]) for name in (*BACKLASH, 'f')}
-    began['from'] = None
+    first, newest = (dict(zip(COLUMNS, row, strict=True)) for row in run.rows[[0, -1]].tolist())
+    learned, source = run.learned, None
     if parameters is not None:
         guess, estimates = first_guess(parameters), parameters.estimates
-        loaded = estimates.load and any(began[name] != getattr(guess, name) for name in BACKLASH)
-        began['from'] = estimates.file if loaded else 'estimator.initial'
-    newest, learned = dict(zip(COLUMNS, run.rows[-1].tolist(), strict=True)), run.learned
+        loaded = estimates.load and any(first[name] != getattr(guess, name) for name in BACKLASH)
+        source = estimates.file if loaded else 'estimator.initial'
     return {
         'estimator': parameters.estimator.law if parameters else None,
         'structure': parameters.structure if parameters else None,
         'samples': run.samples,
         'sample_period': run.sample_period,
         'lost_samples': run.lost_samples,
-        'began_with': began,
+        'began_with': {**{name: first[name] for name in (*BACKLASH, 'f')}, 'from': source},
         'final': {name: newest[name] for name in (*BACKLASH, 'f')},
         'final_std': {name: newest[f'std_{name}'] for name in BACKLASH},
         'truth': {name: newest[f'true_{name}'] if run.has_truth else None for name in BACKLASH},
@@ -67,12 +66,11 @@ def summarise(
         'final_status': words.get(newest['status']),
         'status_share': {word: float(np.mean(status == state)) for state, word in words.items()}
         if status.size else None,
-        'model': {
+        'model': learned and {
             'numerator': list(learned.numerator), 'denominator': list(learned.denominator),
-            'delay_samples': learned.delay_samples,
-        } if learned else None,
-        'noise_ratio': learned.noise_ratio if learned else None,
-        'unexplained': learned.unexplained if learned else None,
+            'delay_samples': learned.delay_samples},
+        'noise_ratio': learned and learned.noise_ratio,
+        'unexplained': learned and learned.unexplained,
     }
 
 
