@@ -97,7 +97,6 @@ def searched(
     v: Array, y: Array, units: Units, options: Options, delays: Sequence[int], progress: Progress,
 ) -> StructureSearch:
     """The best structure with one of these delays, of v and y (N,) that are centred and scaled."""
-    far_off = 0.03  # relative distance of the last gap from the first, with which to begin anew
     progress('searching the gap')
     samples = Samples(v, y, max(delays) + 1, len(v), step_of(y), units)
     found = _with_general(samples, delays)
@@ -108,25 +107,20 @@ def searched(
         samples = kept
         found = _with_general(samples, delays)
     cut = samples.last - round(options.held_out * len(samples.fitted_y))
-    candidates = found[:2]
     structures = [
         Structure(order, delay, integrator) for integrator in options.integrators
         for delay in delays for order in options.orders if order >= integrator]
-    for again in (True, False):
-        progress('comparing orders and delays')
-        compared = _compare(samples, candidates, structures, cut)
-        progress('refining')
-        for _ in structures:
-            chosen = selected(compared)
-            models = _of_gaps(samples, chosen.whole)
-            best = models[0]
-            if not gives_way(best, _eligible(compared)):
-                break
-            # Only the best fit of all shows that a pole is none.
-            compared = [one._replace(whole=best) if one is chosen else one for one in compared]
-        if not again or abs(best.gap - candidates[0].gap) <= far_off * best.gap:
+    progress('comparing orders and delays')
+    compared = _compare(samples, found[:2], structures, cut)
+    progress('refining')
+    for _ in structures:
+        chosen = selected(compared)
+        models = _of_gaps(samples, chosen.whole)
+        best = models[0]
+        if not gives_way(best, _eligible(compared)):
             break
-        candidates = [best, candidates[0]]  # the general G may have been a poor one
+        # Only the best fit of all shows that a pole is none.
+        compared = [one._replace(whole=best) if one is chosen else one for one in compared]
     rows = effective(best.left)
     rivals = [(one.gap, 0.5 * one.behind(best, rows)) for one in models
               if abs(one.gap - best.gap) > ANOTHER * best.gap]
