@@ -168,14 +168,11 @@ def fitted(
 
 def moved_to(
     structure: Structure, like: Model, gap: float | None = None, p0: float | None = None,
-    factor: Sequence[float] = (1.0,),
 ) -> WindowFit:
-    """What a fit of a structure may begin with, from a model; factor: (1, -pole) for a structure
-    with a pole more, which a zero cancels."""
+    """What a fit of a structure may begin with, from a model with as many poles."""
     fit, (m, offset, width) = like.fit, like.fit.theta[:3].tolist()
-    b, a = (np.asarray(np.convolve(one, factor), dtype=float)
-            for one in (like.numerator, np.append(1.0, like.a)))
-    begin = np.append([m, offset, width if gap is None else gap], structure.xi(b, a[1:]))
+    begin = np.append([m, offset, width if gap is None else gap],
+                      structure.xi(like.numerator, like.a))
     return WindowFit(np.zeros(1), fit.p0 if p0 is None else p0, begin, fit.noise_std)
 
 
