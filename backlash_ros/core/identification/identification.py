@@ -17,14 +17,7 @@ import numpy as np
 from backlash_ros.core.estimation.fit import FIRST_STEPS
 from backlash_ros.core.identification import model as models
 from backlash_ros.core.identification import structure_search as search
-from backlash_ros.core.identification.model import (
-    VAGUE,
-    Model,
-    Structure,
-    Units,
-    fitted,
-    moved_to,
-)
+from backlash_ros.core.identification.model import VAGUE, Model, Structure, Units, fitted
 from backlash_ros.core.identification.not_play import Observed, limited, rate_limit
 from backlash_ros.core.identification.structure_search import Options, Progress, StructureSearch
 from backlash_ros.core.identification.verdict import CERTAIN, Findings, Verdict, judge
@@ -147,7 +140,7 @@ def identify(
         whole = y.copy()
         whole[part] = samples.y
         samples = replace(samples, v=v, y=whole, last=len(v))
-        begin = moved_to(best.structure, best, p0=float(v[0]) + 0.5 * best.gap)
+        begin = best.begin(p0=float(v[0]) + 0.5 * best.gap)
         best = fitted(samples, best.structure, begin, steps=FIRST_STEPS)
         kept = search.without_outliers(samples, best)
         if kept is not samples:
@@ -167,13 +160,13 @@ def _why_nothing(v: Array, y: Array, options: Options) -> str:
     """Why there is nothing to fit; empty where there is. y: of the part that is searched."""
     known = np.isfinite(y[max(options.delays or search.EARLY) + 1:])
     # The first samples of them are fitted alone, to predict the others.
-    first = known[:len(known) - round(options.held_out * len(known))]
+    first = known[:len(known) - round(search.HELD_OUT * len(known))]
     needed = 8 * max(Structure(order, 0, False).unknowns
                      for order in (max(options.orders), search.GENERAL_POLES))
     if first.sum() < needed or not known[len(first):].any():
         return (
             f'{int(known.sum())} samples of y are too few, or lie too unevenly, for an order of up '
-            f'to {max(options.orders)}, about {round(needed / (1.0 - options.held_out))} are '
+            f'to {max(options.orders)}, about {round(needed / (1.0 - search.HELD_OUT))} are '
             'needed: record for longer, or limit --order')
     if np.ptp(v) == 0.0:
         return 'v stood still: move it to and fro, past the gap'
@@ -241,7 +234,7 @@ def _described(s: StructureSearch, given: Identification, options: Options) -> I
 def _delay_open(s: StructureSearch) -> bool:
     """Whether one more sample of delay fits as well."""
     samples, taken = replace(s.samples, first=s.samples.first + 1), s.best.structure
-    this, other = (fitted(samples, structure, moved_to(structure, s.best))
+    this, other = (fitted(samples, structure, s.best.begin())
                    for structure in (taken, replace(taken, delay=taken.delay + 1)))
     rows = models.effective(this.left)
     return bool(taken.delay) and other.behind(this, rows) < search.PLATEAU

@@ -150,6 +150,13 @@ class Model:
         """Twice the log-likelihood by which it explains less, of so many independent readings."""
         return rows * log(max(self.squares, TINY) / max(best.squares, TINY))
 
+    def begin(self, gap: float | None = None, p0: float | None = None) -> WindowFit:
+        """What another fit may begin with: the same, with this gap and beginning, and no state."""
+        theta = self.fit.theta.copy()
+        theta[2] = self.gap if gap is None else gap
+        return WindowFit(
+            np.zeros(1), self.fit.p0 if p0 is None else p0, theta, self.fit.noise_std)
+
 
 def fitted(
     samples: Samples, structure: Structure, *begins: WindowFit, steps: int = STEPS,
@@ -164,16 +171,6 @@ def fitted(
             fit = problem.fitted(fit, steps)
         found.append(Model(structure, problem, fit))
     return min(found)
-
-
-def moved_to(
-    structure: Structure, like: Model, gap: float | None = None, p0: float | None = None,
-) -> WindowFit:
-    """What a fit of a structure may begin with, from a model with as many poles."""
-    fit, (m, offset, width) = like.fit, like.fit.theta[:3].tolist()
-    begin = np.append([m, offset, width if gap is None else gap],
-                      structure.xi(like.numerator, like.a))
-    return WindowFit(np.zeros(1), fit.p0 if p0 is None else p0, begin, fit.noise_std)
 
 
 def steiglitz_mcbride(

@@ -28,7 +28,6 @@ from backlash_ros.core.identification.model import (
     effective,
     first_model,
     fitted,
-    moved_to,
 )
 from backlash_ros.core.identification.not_play import Observed, what_it_is
 from backlash_ros.core.identification.verdict import ANOTHER
@@ -38,6 +37,7 @@ from backlash_ros.core.records.readings import noise_of, outliers, quantum
 Progress = Callable[[str], object]
 EARLY, LONGEST_DELAY = (0, 1, 2, 3), 40  # delays that are compared first, and the longest
 GENERAL_POLES = 3  # of the G with which the gap is searched first; it has a tap for each delay
+HELD_OUT = 1.0 / 3.0  # share of the record, its last
 PLATEAU = 10.0  # difference of the criterion below which two delays are equally good
 EXACT = 1e-10  # rms over that of y, less than which no error counts: simulations round
 
@@ -45,14 +45,12 @@ EXACT = 1e-10  # rms over that of y, less than which no error counts: simulation
 @dataclass(frozen=True)
 class Options:
     """What is compared. delays [samples]: none for EARLY, and later ones where these fit better.
-    integrators: whether G has one. slope: m, which cannot be told from the gain of G. held_out:
-    share of the record, its last."""
+    integrators: whether G has one. slope: m, which cannot be told from the gain of G."""
 
     orders: Sequence[int] = (0, 1, 2, 3, 4)
     delays: Sequence[int] = ()
     integrators: Sequence[bool] = (False, True)
     slope: float = 1.0
-    held_out: float = 1.0 / 3.0
 
 
 class Compared(NamedTuple):
@@ -106,7 +104,7 @@ def searched(
     if kept.y is not samples.y or kept.step != samples.step:
         samples = kept
         found = _with_general(samples, delays)
-    cut = samples.last - round(options.held_out * len(samples.fitted_y))
+    cut = samples.last - round(HELD_OUT * len(samples.fitted_y))
     structures = [
         Structure(order, delay, integrator) for integrator in options.integrators
         for delay in delays for order in options.orders if order >= integrator]
@@ -161,7 +159,7 @@ def _of_gaps(samples: Samples, like: Model) -> list[Model]:
     for _, gap, p0, _ in hypotheses:
         if len(begins) <= most and all(abs(gap - other) > ANOTHER * other for other in gaps):
             gaps.append(gap)
-            begins.append(problem.step(moved_to(structure, like, gap, p0), held=True))
+            begins.append(problem.step(like.begin(gap, p0), held=True))
     some = sorted(fitted(samples, structure, begin, steps=FIRST_STEPS) for begin in begins)
     models: list[Model] = []
     for one in some:
