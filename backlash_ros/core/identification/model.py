@@ -157,6 +157,13 @@ class Model:
         return WindowFit(
             np.zeros(1), self.fit.p0 if p0 is None else p0, theta, self.fit.noise_std)
 
+    def begin_with_pole(self, pole: float, structure: Structure) -> WindowFit:
+        """The same for the structure with a pole more, which a zero cancels."""
+        b, a = (np.asarray(np.convolve(one, (1.0, -pole)), dtype=float)
+                for one in (self.numerator, np.append(1.0, self.a)))
+        return replace(self.begin(), theta=np.append(
+            self.fit.theta[:3], structure.xi(b, a[1:])))
+
 
 def fitted(
     samples: Samples, structure: Structure, *begins: WindowFit, steps: int = STEPS,

@@ -189,12 +189,14 @@ def _compare(
     samples: Samples, candidates: Sequence[Model], structures: Sequence[Structure], cut: int,
 ) -> list[Compared]:
     """Fit the structures to the samples before `cut` and to all of them, from models whose gap and
-    beginning are about right."""
+    beginning are about right, and from those with a pole less."""
     train, later = replace(samples, last=cut), replace(samples, first=cut)
     found: dict[Structure, tuple[Model, Model]] = {}
-    for structure in structures:
+    for structure in sorted(structures, key=lambda s: s.order):
         begin = min(first_model(train, structure, like.gap, like.fit.p0) for like in candidates)
-        trained = fitted(train, structure, begin.fit, steps=FIRST_STEPS)
+        smaller = found.get(replace(structure, order=structure.order - 1))
+        also = [smaller[0].begin_with_pole(0.6, structure)] if smaller else []
+        trained = fitted(train, structure, begin.fit, *also, steps=FIRST_STEPS)
         found[structure] = trained, fitted(samples, structure, trained.fit)
     best = min(whole for _, whole in found.values())
     count, rows = len(best.left), effective(best.left)
