@@ -60,7 +60,7 @@ class InputReconstruction:
         self._step[n + 1:, n:-1] = np.eye(lag)
         try:
             before = self._stationary(n + 1)
-            gain, self._covariance = self._gain_of(before), self._measured(before)
+            gain, self._covariance = self._corrected(before)
             variance = float(self._covariance[-1, -1])
         except (np.linalg.LinAlgError, ValueError):
             variance = nan
@@ -87,7 +87,7 @@ class InputReconstruction:
         as_if_resting = np.minimum(np.arange(size + self.lag), size - 1)
         covariance: Array = p[np.ix_(as_if_resting, as_if_resting)]
         for _ in range(self.lag):
-            covariance = self._propagated(self._measured(covariance))
+            covariance = self._propagated(self._corrected(covariance)[1])
             covariance[:size, :size] = p
         return covariance
 
@@ -124,15 +124,14 @@ class InputReconstruction:
         if y is not None:
             e = y / self._scale - self._c * float(self._z[0])
             self.innovation = e * self._scale
-            self._z += self._gain_of(self._covariance) * e
-            self._covariance = self._measured(self._covariance)
+            gain, self._covariance = self._corrected(self._covariance)
+            self._z += gain * e
         return self.u_hat
 
-    def _gain_of(self, p: Array) -> Array:
-        return np.asarray(p[:, 0] * (self._c / (self._c**2 * p[0, 0] + self._noise)))
-
-    def _measured(self, p: Array) -> Array:
-        return p - np.outer(self._gain_of(p), self._c * p[0])
+    def _corrected(self, p: Array) -> tuple[Array, Array]:
+        """The gain for a measurement after this covariance, and the covariance with it."""
+        gain: Array = p[:, 0] * (self._c / (self._c**2 * p[0, 0] + self._noise))
+        return gain, p - np.outer(gain, self._c * p[0])
 
     def _propagated(self, p: Array) -> Array:
         p = self._step @ p @ self._step.T
