@@ -263,8 +263,9 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
         ticks, references, outputs = self._waiting
         while self.active and all(self._waiting):
             # A tick is the sample: messages are not told apart by number then.
-            unnumbered = outputs.popleft()._replace(sequence=sample_counter.UNNUMBERED)
-            output = unnumbered._replace(stamp_ns=ticks.popleft())
+            output = outputs.popleft()._replace(
+                sequence=sample_counter.UNNUMBERED, stamp_ns=ticks.popleft()
+            )
             if steps := self.loops.answer({'': output}, references.popleft()):
                 self.loops.by_name[''].core.refine()
                 self._follow_up(steps)

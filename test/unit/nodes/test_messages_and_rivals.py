@@ -14,7 +14,7 @@ from std_msgs.msg import Float64
 from backlash_ros import topics
 from backlash_ros.middleware import PROFILE, prefer_loopback
 from backlash_ros.nodes.control.publishing import watched_values
-from backlash_ros.nodes.control.rivals import ENDPOINT, SINCE, Rival, Rivals
+from backlash_ros.nodes.control.rivals import ENDPOINT, SINCE, CommandLock, Rival, Rivals
 from backlash_ros.nodes.runtime import messages
 from backlash_ros.nodes.runtime.process import unreached
 
@@ -157,3 +157,13 @@ def test_who_is_inactive_has_no_rivals_and_is_none() -> None:
     assert rivals.among({'x': '/other'}, 10.3) == (Rival('/other', True),)
     rivals.begin(0, 10.35)
     assert rivals.among({'x': '/other'}, 10.4) == ()
+
+
+def test_one_of_a_machine_has_the_lock_of_a_topic_until_it_lets_go_or_ends() -> None:
+    first, second = (CommandLock(0, '/control of a test') for _ in range(2))
+    assert [first.take(), second.take(), first.take()] == [True, False, True]
+    assert CommandLock(1, '/control of a test').take()
+    assert CommandLock(0, '/other').take()
+    first.release()
+    assert [second.take(), first.take()] == [True, False]
+    second.release()
