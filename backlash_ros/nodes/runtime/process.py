@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import ctypes
+import difflib
 import gc
 import json
 import os
@@ -240,7 +241,7 @@ def run(
             return BAD_INPUT
         for option, file in pairwise(arguments):
             if option == '--params-file' and (
-                    complaint := unreached(file, node.get_fully_qualified_name())):
+                    complaint := unreached(file, executable, node.get_fully_qualified_name())):
                 node.log.warning(complaint)
         node.signals = signals
         executor = PromptExecutor(node)
@@ -326,14 +327,19 @@ def _ros_parameter(name: str, value: Value) -> RosParameter:
     return RosParameter(name, value=list(value) if isinstance(value, tuple) else value)
 
 
-def unreached(file: str, full_name: str) -> str:
-    """What to do with a parameter file that ROS 2 passes over without a word, empty if none."""
+def unreached(file: str, executable: str, full_name: str) -> str:
+    """What to do with sections that seem to be meant for a node, where ROS 2 passes over all."""
     import yaml  # most nodes start without a file
 
-    namespace, _, own = full_name.strip('/').rpartition('/')
-    ways = {'**', f'**/{own}', f'*/{own}', f'{namespace}/**', f'{namespace}/{own}'.strip('/')}
     # ROS 2 itself has refused what cannot be read.
-    sections = yaml.safe_load(Path(file).read_text(encoding='utf-8'))
-    if not ways.isdisjoint(str(section).strip('/') for section in sections or ()):
+    content = yaml.safe_load(Path(file).read_text(encoding='utf-8')) or ()
+    namespace, _, own = full_name.strip('/').rpartition('/')
+    meant = [section for section in (str(name).strip('/') for name in content)
+             if difflib.get_close_matches(section.rpartition('/')[2], [own, executable], cutoff=0.8)]
+    reaching = {f'**/{own}', f'*/{own}', full_name.strip('/')}
+    # One with a namespace may be for another axis.
+    passed_over = [section for section in meant if not (namespace and '/' in section)]
+    if not passed_over or not reaching.isdisjoint(meant):
         return ''
-    return f'{file}: no section is for {full_name}, its values are not used: write /**/{own}'
+    return f'{file}: section {", ".join(passed_over)} is not for {full_name}, its values are not ' \
+        f'used: write /**/{own}'
