@@ -334,8 +334,8 @@ def unreached(file: str, executable: str, full_name: str) -> str:
     # ROS 2 itself has refused what cannot be read.
     content = yaml.safe_load(Path(file).read_text(encoding='utf-8')) or ()
     namespace, _, own = full_name.strip('/').rpartition('/')
-    meant = [section for section in (str(name).strip('/') for name in content)
-             if difflib.get_close_matches(section.rpartition('/')[2], [own, executable], cutoff=0.8)]
+    meant = [section for section in (str(name).strip('/') for name in content) if
+             difflib.get_close_matches(section.rpartition('/')[2], [own, executable], cutoff=0.8)]
     reaching = {f'**/{own}', f'*/{own}', full_name.strip('/')}
     # One with a namespace may be for another axis.
     passed_over = [section for section in meant if not (namespace and '/' in section)]
