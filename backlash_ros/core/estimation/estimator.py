@@ -19,7 +19,7 @@ from backlash_ros.core.estimation.fit import Window
 from backlash_ros.core.estimation.observer import Following, Gain, Place, gains_of, state_after
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.state_machine import learn
-from backlash_ros.core.jobs import ChannelSamples, Executor, Failure
+from backlash_ros.core.jobs import Executor, Failure
 from backlash_ros.core.law import Interval, Law, LawReport
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.parameters import Parameters
@@ -42,15 +42,38 @@ class Fitted(NamedTuple):
     better: Proposal | None = None
 
 
+class Recorder:
+    """Samples of the loop, the newest `capacity` at least; end: number of the next one."""
+
+    def __init__(self, capacity: int) -> None:
+        self.end, self._capacity = 0, capacity
+        self._kept = Window(0, *np.empty((3, 2 * capacity)))
+
+    def append(self, v: float, y: float, other: float) -> None:
+        kept, at = self._kept, self.end - self._kept.first
+        if at == len(kept.v):
+            # Into other arrays: a fit may be looking at these.
+            first, *newest = kept.between(self.end - self._capacity)
+            doubled = (np.concatenate([each, np.empty_like(each)]) for each in newest)
+            kept, at = Window(first, *doubled), self._capacity
+            self._kept = kept
+        kept.v[at], kept.y[at], kept.other[at] = v, y, other
+        self.end += 1
+
+    def since(self, first: int) -> Window:
+        """The samples from a number on, as far as they are there; they do not change any more."""
+        return self._kept.between(first, self.end)
+
+
 def fitted(
-    samples: ChannelSamples, setup: Setup, before: Belief, model: TransferFunction, proposed: Array,
+    samples: Window, setup: Setup, before: Belief, model: TransferFunction, proposed: Array,
 ) -> Fitted:
     """What is believed with these samples: the job that is done beside the loop.
 
     model: whose state the structure wants. proposed: xi of the newest G (K,), () if to be left.
     """
     swapped = before.kept.swapped
-    record = Window(samples.first, *samples.columns).swapped(swapped)
+    record = samples.swapped(swapped)
     first = max(before.kept.first, record.end - settings.LONGEST)
     belief = learn(setup, record.between(first), before)
     fit, kept = belief.fit, belief.kept
@@ -85,7 +108,8 @@ class MovingHorizon(Law):
         self._setup = Setup(family, 0.0, bounds, bounds.c_r[1] - bounds.c_l[0],
                             initial.c_r - initial.c_l, 0.0, np.zeros(3))
         self.retune(p)
-        self._channel = (executor or Executor()).open(3, settings.LONGEST + 16_384)
+        self._record = Recorder(settings.LONGEST)
+        self._channel = (executor or Executor()).open()
         self._belief = Belief()
         if initial.learned:
             std = np.array([initial.std_m, initial.std_c_r, initial.std_c_l])
@@ -136,7 +160,7 @@ class MovingHorizon(Law):
             undecided=belief.published is None and found is not None and found.m > 0.0
             and found.left.turns >= settings.HELD_REVERSALS,
             forbidden=outside[0] if outside else None,
-            waiting=self._channel.record.end - belief.end, outliers=self._following.outliers,
+            waiting=self._record.end - belief.end, outliers=self._following.outliers,
             reattributed=self._reattributed, failed_fits=self._failed_fits)
 
     def response_std(self, z: NDArray[np.complex128]) -> Array:
@@ -164,7 +188,7 @@ class MovingHorizon(Law):
     def update(self, y: float | None, interval: Interval) -> None:
         if self.adapting and not self._recording:
             # Another record: the samples before it are not those before the next one.
-            before, end = self._belief, self._channel.record.end
+            before, end = self._belief, self._record.end
             self._belief = Belief(
                 kept=Kept(first=end), end=end, next_at=end + settings.FIRST_FIT,
                 published=before.published, inherited=before.inherited or before.published)
@@ -175,7 +199,7 @@ class MovingHorizon(Law):
         following.step(y, interval, self.estimate)
         resting = following.since_motion > family.memory  # longer than G remembers
         if self.adapting and not (resting and not family.integrates):
-            self._channel.append(interval.v, nan if y is None else y, interval.other)
+            self._record.append(interval.v, nan if y is None else y, interval.other)
         status = self._belief.reason
         if self._lost_in_a_row >= 20:
             status = Status.NO_DATA
@@ -188,13 +212,13 @@ class MovingHorizon(Law):
         channel, following, setup = self._channel, self._following, self._setup
         if channel.busy:
             self._take(channel.poll())
-        due = channel.record.end >= self._belief.next_at or following.surprised
+        due = self._record.end >= self._belief.next_at or following.surprised
         resting = following.observer and following.since_motion > setup.family.memory
         if channel.busy or not due or not self.adapting or resting:
             return
         following.beyond += following.surprised  # once
-        channel.submit(fitted, setup, self._belief, following.model.transfer_function,
-                       self._proposed.xi, since=self._belief.kept.first)
+        channel.submit(fitted, self._record.since(self._belief.kept.first), setup, self._belief,
+                       following.model.transfer_function, self._proposed.xi)
         self._take(channel.poll())
 
     def _take(self, result: Fitted | Failure | None) -> None:
@@ -203,7 +227,7 @@ class MovingHorizon(Law):
             return
         if isinstance(result, Failure):
             self._failed_fits += 1
-            self._belief = self._belief._replace(next_at=self._channel.record.end + settings.FEWEST)
+            self._belief = self._belief._replace(next_at=self._record.end + settings.FEWEST)
             return
         before, belief, following = self._belief, result.belief, self._following
         self._belief, place, fit = belief, result.place, belief.fit
@@ -218,9 +242,9 @@ class MovingHorizon(Law):
         if not belief.trusted and following.observer is not None:
             following.observer.settle(fit.noise)  # no fit says where the state is
             return
-        record = self._channel.record
-        newer = record.between(belief.end, record.end).columns[:2]
-        following.go_on_from(place, newer, self.estimate, fit.noise, belief.trusted)
+        newer = self._record.since(belief.end)
+        following.go_on_from(place, np.array([newer.v, newer.y]), self.estimate, fit.noise,
+                             belief.trusted)
 
     def _estimate_of(self, belief: Belief, known: Known) -> Estimate:
         values, e = self._setup.bounds.project(*known.crossings.tolist()), self.estimate

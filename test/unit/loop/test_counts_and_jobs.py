@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from backlash_ros.core.jobs import ChannelSamples, Executor
+from backlash_ros.core.estimation.estimator import Recorder
 from backlash_ros.core.loop.diagnosis import AGAIN_S, LASTS_S, Finding, Level, LevelLog
 from backlash_ros.core.loop.loop_statistics import Lately, LoopStatistics
 from backlash_ros.core.loop.sample_counter import DriverPeriod
@@ -187,30 +187,24 @@ def test_changes_reach_the_joints_that_have_no_value_of_their_own() -> None:
     assert changed.of_joint('elbow')['structure'] == 'proportional'
 
 
-def everything(samples: ChannelSamples, *more: object) -> tuple[object, ...]:
-    return samples.first, samples.columns.tolist(), *more
-
-
 @given(counts=st.lists(st.integers(0, 300), max_size=12), capacity=st.integers(1, 500))
-def test_a_job_sees_the_newest_samples_with_their_numbers(counts, capacity):
-    channel = Executor().open(2, capacity)
+def test_a_fit_sees_the_newest_samples_with_their_numbers_though_more_come(counts, capacity):
+    recorder, seen = Recorder(capacity), []
     end = 0
     for count in counts:
         for k in range(end, end + count):
-            channel.append(k, -k)
+            recorder.append(k, -k, 0.5)
         end += count
-        assert channel.submit(everything, 'x')
-        channel.append(end, -end)
-        begin = max(end - capacity, 0)
-        numbers = range(begin, end)
-        assert channel.poll() == (begin, [[*numbers], [-k for k in numbers]], 'x')
-        end += 1
+        seen.append((end, recorder.since(end - capacity)))
+    for end, window in seen:
+        numbers = list(range(max(end - capacity, 0), end))
+        assert (window.first, window.end) == (max(end - capacity, 0), end)
+        assert (window.v.tolist(), window.y.tolist()) == (numbers, [-k for k in numbers])
 
 
-def test_a_job_sees_no_samples_before_those_it_needs() -> None:
-    channel = Executor().open(1, 1000)
+def test_a_fit_sees_no_samples_before_those_it_needs() -> None:
+    recorder = Recorder(1000)
     for k in range(20):
-        channel.append(k)
+        recorder.append(k, k, k)
     for since in (15, 19, 20):
-        channel.submit(everything, since=since)
-        assert channel.poll() == (since, [[*range(since, 20)]])
+        assert recorder.since(since).v.tolist() == [*range(since, 20)]
