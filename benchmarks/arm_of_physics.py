@@ -30,8 +30,7 @@ from joint_trajectory import swing
 
 from backlash_ros.core.assembly import first_guess, known_before
 from backlash_ros.core.control.motion import Drive, drive_limits
-from backlash_ros.core.loop.control_loop import Driver
-from backlash_ros.core.loop.joint_loops import JointLoops
+from backlash_ros.core.loop.control_loop import Driver, JointLoops
 from backlash_ros.core.loop.sample_counter import Output, SampleCounter
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.tools.config import read_configuration

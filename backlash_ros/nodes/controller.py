@@ -22,8 +22,8 @@ from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.jobs import Executor, WorkerExecutor
 from backlash_ros.core.loop import sample_counter
 from backlash_ros.core.loop.command_history import KEPT_COMMANDS
+from backlash_ros.core.loop.control_loop import JointLoops
 from backlash_ros.core.loop.diagnosis import Neighbours
-from backlash_ros.core.loop.joint_loops import JointLoops
 from backlash_ros.core.loop.sample_counter import Output, SampleCounter, Timing
 from backlash_ros.core.parameters import CONTROLLER, ParameterError, Parameters
 from backlash_ros.nodes.control.joint import Joint, offer_services
@@ -64,8 +64,8 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
             for joint in p.joint_names for initial in [p.of_joint(joint).control.initial]
         })
         # A fit that shared the process of the loop would hold up its commands.
-        self._executor: Executor = \
-            Executor() if p.lockstep else WorkerExecutor(assembly.WORKER_MODULES)
+        self._executor = Executor() if p.lockstep else \
+            WorkerExecutor(assembly.WORKER_MODULES, len(p.joint_names))
         if not p.lockstep:
             # The first command begins with what the driver reports, even if it is not learned from.
             self._io.listen_to(self._io.topics.applied, self._on_report, KEPT_COMMANDS)

@@ -6,60 +6,52 @@ the reported one where the loop would have believed it, else the command.
 
 from array import array
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from backlash_ros.core.assembly import build_controller, build_plant, build_reference
-from backlash_ros.core.control.controller import LONGEST_GAP, AdaptiveController
+from backlash_ros.core.control.controller import LONGEST_GAP
 from backlash_ros.core.control.limits import plausible
 from backlash_ros.core.loop.command_history import ReportOrigin, ReportTrust, report_use
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.plant.simulated_plant import SimulatedPlant
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord, learned_model_of, row_of
 
 
-@dataclass
 class ClosedLoop:
-    """Controller, plant and reference stepped together. lose: says whether y(k) is lost."""
+    """Controller, plant and reference stepped together; the seed also draws which y are lost."""
 
-    controller: AdaptiveController
-    plant: SimulatedPlant
-    reference: Callable[[float], float]
-    sample_period: float
-    p: Parameters
-    lose: Callable[[], bool] = lambda: False
+    def __init__(self, p: Parameters) -> None:
+        self.p, self.controller, self.plant = p, build_controller(p), build_plant(p)
+        self.reference: Callable[[float], float] = build_reference(p)
+        self._rng = np.random.default_rng([p.seed, 1])
 
     def run(self, samples: int) -> RunRecord:
         """Simulate and return every signal."""
+        p, controller, plant = self.p, self.controller, self.plant
         values = array('d')  # row by row: NumPy takes longer to take in a row
         lost, v = 0, 0.0
         for k in range(samples):
-            t = k * self.sample_period
-            y = self.plant.measure()
-            if k > 0 and self.lose():
+            t = k * p.sample_period
+            y = plant.measure()
+            if k > 0 and p.output_loss > 0.0 and self._rng.random() < p.output_loss:
                 lost += 1
-                self.plant.step(v)
+                plant.step(v)
             else:
-                step = self.controller.step(y, self.reference(t), lost)
-                self.controller.refine()
+                step = controller.step(y, self.reference(t), lost)
+                controller.refine()
                 lost, v = 0, step.v
-                u, truth = self.plant.step(v), self.plant.backlash
-                values.extend(row_of(
-                    t, y, v, u, step, self.controller.estimator, (truth.m, truth.c_r, truth.c_l)))
-        rows, learned = np.array(values), learned_model_of(self.controller.estimator, self.p)
-        return RunRecord(rows.reshape(-1, len(COLUMNS)), self.sample_period,
-                         self.controller.lost_samples + lost, learned)
+                u, truth = plant.step(v), plant.backlash
+                values.extend(row_of(t, y, v, u, step, controller.estimator,
+                                     (truth.m, truth.c_r, truth.c_l)))
+        return RunRecord(
+            np.array(values).reshape(-1, len(COLUMNS)), p.sample_period,
+            controller.lost_samples + lost, learned_model_of(controller.estimator, p))
 
 
 def build_closed_loop(p: Parameters) -> ClosedLoop:
-    """The loop of the given parameters; the seed also draws which outputs are lost."""
-    rng = np.random.default_rng([p.seed, 1])
-    return ClosedLoop(
-        build_controller(p), build_plant(p), build_reference(p), p.sample_period, p,
-        lambda: p.output_loss > 0.0 and float(rng.random()) < p.output_loss,
-    )
+    """The loop of the given parameters."""
+    return ClosedLoop(p)
 
 
 def replay(

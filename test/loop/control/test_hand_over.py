@@ -58,7 +58,7 @@ def test_v_goes_on_as_it_moved(take_over, at):
         if k == at:
             loop.controller = take_over(loop.controller)
             v[-1] = loop.controller.motion.v
-        step = loop.controller.step(loop.plant.measure(), loop.reference(k * loop.sample_period))
+        step = loop.controller.step(loop.plant.measure(), loop.reference(k * loop.p.sample_period))
         loop.plant.step(step.v)
         v.append(step.v)
     moves = np.abs(np.diff(v))

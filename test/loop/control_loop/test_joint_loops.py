@@ -6,8 +6,7 @@ from math import inf, isnan, nan
 import numpy as np
 
 from backlash_ros.core.assembly import first_guess
-from backlash_ros.core.loop.control_loop import Driver
-from backlash_ros.core.loop.joint_loops import JointLoops
+from backlash_ros.core.loop.control_loop import Driver, JointLoops
 from backlash_ros.core.loop.sample_counter import Output, SampleCounter
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.backlash import Backlash

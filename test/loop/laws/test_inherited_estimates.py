@@ -14,7 +14,7 @@ TRUE = np.array([1.3, 3.0, -3.0])
 def run(loop: ClosedLoop, controller: AdaptiveController, samples: int) -> list[Estimate]:
     estimates = []
     for _ in range(samples):
-        y_m = loop.reference(loop.plant.sample * loop.sample_period)
+        y_m = loop.reference(loop.plant.sample * loop.p.sample_period)
         step = controller.step(loop.plant.measure(), y_m)
         controller.refine()
         loop.plant.step(step.v)

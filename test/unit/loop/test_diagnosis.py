@@ -13,7 +13,6 @@ from backlash_ros.core.loop.diagnosis import (
     LONGEST_TEXT,
     UNNAMED,
     Finding,
-    Learning,
     Level,
     LoopFigures,
     Neighbours,
@@ -31,12 +30,12 @@ WELL = LoopFigures(
         TopicFigures('plant_output', peers=(DRIVER,)),
         TopicFigures('reference', peers=(Peer('/reference', 'Float64'),)),
         TopicFigures('control', peers=(DRIVER,)),
-    ), learning=Learning(Status.TRACKING), used=600,
+    ), status=Status.TRACKING, used=600,
 )
 
 
 def replace(figures: LoopFigures, **changes: Any) -> LoopFigures:
-    for part in ('timing', 'around', 'learning'):
+    for part in ('timing', 'around'):
         present = getattr(figures, part)
         own = {name: changes.pop(name) for name in present._fields if name in changes}
         changes[part] = present._replace(**own)
@@ -150,22 +149,22 @@ def test_each_cause_is_named_with_its_figure_and_its_cure(changes, level, text):
 def test_estimates_of_before_that_hold_are_not_said_to_move() -> None:
     acquiring = replace(WELL, status=Status.ACQUIRING)
     assert first(acquiring).kind == 'acquiring'
-    assert first(replace(acquiring, report=LawReport(unconfirmed=True))).kind == 'known'
-    assert first(replace(WELL, report=LawReport(unconfirmed=True))) == LEARNED
-    assert first(replace(acquiring, report=LawReport(unconfirmed=True), adapting=False)).kind == \
+    assert first(replace(acquiring, law=LawReport(unconfirmed=True))).kind == 'known'
+    assert first(replace(WELL, law=LawReport(unconfirmed=True))) == LEARNED
+    assert first(replace(acquiring, law=LawReport(unconfirmed=True), adapting=False)).kind == \
         'adaptation off'
 
 
 @pytest.mark.parametrize(('changes', 'text'), [
-    ({'report': LawReport(unexplained=0.234)},
+    ({'law': LawReport(unexplained=0.234)},
      '23.4 % of m*gap of the motion of u fits no G and no backlash: check G(z), load, sensor'),
-    ({'report': LawReport(coasts=True, unexplained=0.234)},
+    ({'law': LawReport(coasts=True, unexplained=0.234)},
      'the load coasts in the gap (23 % of m*gap): brake it, or move more slowly'),
-    ({'report': LawReport(wrong_sign=True, unexplained=0.3)},
+    ({'law': LawReport(wrong_sign=True, unexplained=0.3)},
      'plant_output moves against v: reverse it, or the sign of plant.numerator'),
     # What noise leaves, or what has no gap to be compared with, is no reason.
-    ({'report': LawReport(unexplained=0.01)}, BLAMED),
-    ({'report': LawReport(unexplained=inf)}, BLAMED),
+    ({'law': LawReport(unexplained=0.01)}, BLAMED),
+    ({'law': LawReport(unexplained=inf)}, BLAMED),
 ])
 def test_a_contradiction_is_named_by_what_the_fit_has_found(changes, text):
     found = first(replace(INCONSISTENT, **changes))
@@ -181,7 +180,7 @@ def test_a_contradiction_is_named_by_what_the_fit_has_found(changes, text):
      'it'),
 ])
 def test_a_bound_that_forbids_an_estimate_is_a_warning_with_what_was_found(forbidden, text):
-    figures = replace(WELL, status=Status.ACQUIRING, report=LawReport(forbidden=forbidden))
+    figures = replace(WELL, status=Status.ACQUIRING, law=LawReport(forbidden=forbidden))
     assert findings_of(figures) == [Finding(Level.WARN, 'bound', text)]
 
 
@@ -192,7 +191,7 @@ def test_the_model_is_not_blamed_where_a_tenth_of_the_commands_is_late(late, kin
 
 
 def test_what_the_fit_has_found_goes_before_what_may_be_missing() -> None:
-    for known in ({'report': LawReport(wrong_sign=True)}, {'report': LawReport(unexplained=0.2)}):
+    for known in ({'law': LawReport(wrong_sign=True)}, {'law': LawReport(unexplained=0.2)}):
         figures = replace(INCONSISTENT, unreported=30, inconsistent_s=10.0, **known)
         assert [finding.kind for finding in findings_of(figures)] == ['model', 'unreported']
 
@@ -202,7 +201,7 @@ def test_what_the_fit_has_found_goes_before_what_may_be_missing() -> None:
     {'period': Period(0.00506, 1e-7, 0.005)}, {'intervals_s': (0.02, 0.02, 0.02)},
 ])
 def test_a_wrong_sign_is_named_before_what_it_or_a_busy_machine_leads_to(changes):
-    found = findings_of(replace(INCONSISTENT, report=LawReport(wrong_sign=True), **changes))
+    found = findings_of(replace(INCONSISTENT, law=LawReport(wrong_sign=True), **changes))
     assert (found[0].kind, len(found)) == ('model', 2)
 
 
