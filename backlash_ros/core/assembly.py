@@ -16,8 +16,7 @@ from backlash_ros.core.control.tracking.design import (
     preview_gains,
 )
 from backlash_ros.core.control.tracking.tracking import Tracking
-from backlash_ros.core.estimate import Bounds, Estimate
-from backlash_ros.core.estimates_file import load_estimate
+from backlash_ros.core.estimate import Bounds, Estimate, load_estimate
 from backlash_ros.core.estimation.estimator import MovingHorizon, fitted
 from backlash_ros.core.jobs import Executor
 from backlash_ros.core.law import Law

@@ -14,8 +14,7 @@ from backlash_ros.core.assembly import build_model, build_true_model
 from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.control.limits import Limits
 from backlash_ros.core.control.structure import LARGEST_F_OVER_M
-from backlash_ros.core.estimate import Estimate, Status
-from backlash_ros.core.estimates_file import was_given
+from backlash_ros.core.estimate import Estimate, Status, was_given
 from backlash_ros.core.parameters import ParameterError, Parameters
 from backlash_ros.core.plant.transfer_function import TransferFunction
 

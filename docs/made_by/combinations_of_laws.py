@@ -8,7 +8,7 @@ import numpy as np
 
 from backlash_ros.core import Estimate, Parameters, Status, build_closed_loop
 from backlash_ros.core.assembly import LAWS, STRUCTURES, law_fits
-from backlash_ros.core.estimates_file import was_given
+from backlash_ros.core.estimate import was_given
 
 SAMPLES, RESTS_FROM = 1000, 500
 SEED = 5

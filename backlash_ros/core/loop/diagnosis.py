@@ -6,8 +6,7 @@ from enum import IntEnum
 from math import inf, isfinite, nan
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
-from backlash_ros.core.estimate import Status
-from backlash_ros.core.estimates_file import was_given
+from backlash_ros.core.estimate import Status, was_given
 from backlash_ros.core.law import LawReport, OutOfBounds
 from backlash_ros.core.loop.loop_statistics import Counts
 from backlash_ros.core.loop.sample_counter import Timing

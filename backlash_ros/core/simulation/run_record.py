@@ -7,8 +7,7 @@ from math import nan
 import numpy as np
 
 from backlash_ros.core.control.controller import ControlStep
-from backlash_ros.core.estimate import Estimate
-from backlash_ros.core.estimates_file import was_given
+from backlash_ros.core.estimate import Estimate, was_given
 from backlash_ros.core.law import Law
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.transfer_function import Array

@@ -12,7 +12,7 @@ from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
 from backlash_ros.core.assembly import build_controller, first_guess
-from backlash_ros.core.estimates_file import save_estimate, worth_saving
+from backlash_ros.core.estimate import save_estimate, worth_saving
 from backlash_ros.core.loop import diagnosis
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.loop_statistics import Lately

@@ -12,8 +12,7 @@ import numpy as np
 
 from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core.assembly import build_controller, first_guess
-from backlash_ros.core.estimate import Estimate
-from backlash_ros.core.estimates_file import save_estimate
+from backlash_ros.core.estimate import Estimate, save_estimate
 from backlash_ros.core.identification.actuator import with_actuator
 from backlash_ros.core.identification.identification import Details, Identification, identify
 from backlash_ros.core.identification.structure_search import Options

@@ -10,7 +10,7 @@ from places import ROOT
 
 from backlash_ros.core.assembly import LAWS, STRUCTURES, build_controller, law_fits
 from backlash_ros.core.control.structure import LARGEST_F_OVER_M, LARGEST_FEEDBACK
-from backlash_ros.core.estimates_file import was_given
+from backlash_ros.core.estimate import was_given
 from backlash_ros.core.parameters import ParameterError, Parameters
 
 DOCS = ROOT / 'docs'

@@ -8,7 +8,7 @@ import pytest
 from test_identification import PERIOD_S, motion, record
 
 from backlash_ros.core import Estimate, Parameters, build_controller
-from backlash_ros.core.estimates_file import save_estimate
+from backlash_ros.core.estimate import save_estimate
 from backlash_ros.tools import simulate as simulate
 from backlash_ros.tools.cli import InputError
 from backlash_ros.tools.config import effective_parameters

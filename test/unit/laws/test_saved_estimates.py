@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from backlash_ros.core import Estimate, Parameters, Status, build_closed_loop, build_controller
-from backlash_ros.core.estimates_file import load_estimate, save_estimate, worth_saving
+from backlash_ros.core.estimate import load_estimate, save_estimate, worth_saving
 from backlash_ros.core.loop.control_loop import ControlLoop, Driver
 from backlash_ros.core.loop.sample_counter import SampleCounter
 from backlash_ros.core.parameters import ParameterError

@@ -18,7 +18,7 @@ LAYERS = ('core', 'bags', 'nodes', 'tools')
 # Each room of the core imports from those before it only; likewise the parts of estimation.
 ROOMS = (
     'jobs', 'parameters', 'plant', 'reference', 'estimate', 'law', 'laws', 'estimation', 'control',
-    'scenario', 'estimates_file', 'assembly', 'loop', 'records', 'simulation', 'record_fit',
+    'scenario', 'assembly', 'loop', 'records', 'simulation', 'record_fit',
     'identification', 'driver_check',
 )
 ESTIMATION = (

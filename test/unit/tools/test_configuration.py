@@ -7,7 +7,7 @@ import pytest
 from places import ROOT
 
 from backlash_ros.core import Parameters, build_closed_loop, build_controller
-from backlash_ros.core.estimates_file import load_estimate
+from backlash_ros.core.estimate import load_estimate
 from backlash_ros.core.parameters import ParameterError
 from backlash_ros.tools.cli import InputError
 from backlash_ros.tools.config import (
