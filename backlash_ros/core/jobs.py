@@ -39,16 +39,13 @@ class Channel:
         self.result: Callable[[], Any] | None = None  # once it is there
         self._executor = executor
 
-    def submit(self, job: Job, *args: Any) -> bool:
-        """Have job(*args) computed; False while busy.
+    def submit(self, job: Job, *args: Any) -> None:
+        """Have job(*args) computed, where there is none under way.
 
         job: a function at the top level of a module, which changes none of its arguments.
         """
-        if self.busy:
-            return False
         self.busy = True
         self._executor.begin(self, job, args)
-        return True
 
     def poll(self) -> Any:
         """The result of the job, or its Failure, once it is finished; None before."""
@@ -75,18 +72,15 @@ class Executor:
         return Channel(self)
 
     def begin(self, channel: Channel, job: Job, args: tuple[Any, ...]) -> None:
-        result = _computed(job, args)
+        result: Any
+        try:
+            result = job(*args)
+        except Exception as error:  # whatever it is: the loop goes on without this result
+            result = Failure(type(error).__name__)
         channel.result = lambda: result
 
     def close(self) -> None:
         """End it; jobs that are under way are dropped."""
-
-
-def _computed(job: Job, args: tuple[Any, ...]) -> Any:
-    try:
-        return job(*args)
-    except Exception as error:  # whatever it is: the loop goes on without this result
-        return Failure(type(error).__name__)
 
 
 class WorkerExecutor(Executor):
@@ -221,8 +215,9 @@ def _receive(link: Connection, requests: SimpleQueue[bytes]) -> None:
 
 
 def _result_of(job: bytes) -> bytes:
-    """The pickled result of a job, or Failure where job or result cannot be pickled."""
+    """The pickled result of a job, or Failure; also where job or result cannot be pickled."""
     try:
-        return pickle.dumps(_computed(*pickle.loads(job)), -1)
+        function, args = pickle.loads(job)
+        return pickle.dumps(function(*args), -1)
     except Exception as error:
         return pickle.dumps(Failure(type(error).__name__), -1)
