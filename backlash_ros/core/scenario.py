@@ -3,11 +3,17 @@
 Apart from assembly.py, so that the nodes for these start without loading what learns and controls.
 """
 
-from backlash_ros.core.parameters import Parameters
+import csv
+from math import asin, floor, isfinite, pi, sin
+from pathlib import Path
+
+from backlash_ros.core.parameters import ParameterError, Parameters
 from backlash_ros.core.plant.actuator import Actuator
 from backlash_ros.core.plant.simulated_plant import SimulatedPlant, altered_plant, delayed
 from backlash_ros.core.plant.transfer_function import TransferFunction
-from backlash_ros.core.reference.signal import ReferenceSignal
+
+# Shapes of the phase alone, which go on where they are if the frequency changes.
+PERIODIC = ('sine', 'square', 'triangle', 'multisine')
 
 
 def build_model(p: Parameters) -> TransferFunction:
@@ -37,6 +43,76 @@ def build_true_model(p: Parameters) -> TransferFunction:
 def build_plant(p: Parameters) -> SimulatedPlant:
     """The simulated plant with its hidden backlash."""
     return SimulatedPlant(p, build_true_model(p), build_actuator(p))
+
+
+class ReferenceSignal:
+    """y_m(t) = bias + amplitude * shape(t), by the parameters of the reference.
+
+    frequency [rad/s]; a step rises after half a period; chirp: from frequency_start to frequency
+    within sweep_time [s], linear, and again. samples: for waveform: file instead of those of the
+    file, one per sample period, the last one held. Raises ParameterError.
+    """
+
+    def __init__(self, p: Parameters, samples: tuple[float, ...] = ()) -> None:
+        self._p, self.waveform, self.frequency = p, p.waveform, p.frequency
+        self._samples = samples or read_reference_file(p)
+        if self.waveform == 'file' and not self._samples:
+            raise ParameterError('file', p.file, 'must hold at least one sample for waveform: file')
+
+    def __call__(self, t: float) -> float:
+        """y_m at time t >= 0 [s]."""
+        return self._p.bias + self._p.amplitude * self._shape(t)
+
+    def _shape(self, t: float) -> float:
+        phase = self.frequency * t
+        if self.waveform == 'sine':
+            return sin(phase)
+        if self.waveform == 'step':
+            return 1.0 if phase >= pi else 0.0
+        if self.waveform == 'square':
+            return 1.0 if phase % (2.0 * pi) < pi else -1.0
+        if self.waveform == 'triangle':
+            return 2.0 / pi * asin(max(-1.0, min(1.0, sin(phase))))
+        if self.waveform == 'multisine':
+            # Schroeder's phases keep the crest low.
+            harmonics = enumerate((1, 2, 3, 5))
+            return sum(sin(h * self.frequency * t - pi * i * (i + 1) / 4) for i, h in harmonics) / 4
+        if self.waveform == 'chirp':
+            within, start = t % self._p.sweep_time, self._p.frequency_start
+            slope = (self.frequency - start) / self._p.sweep_time
+            return sin(start * within + 0.5 * slope * within * within)
+        # Half a period of slack: t = k T in floating point may fall just short of sample k.
+        index = floor(t / self._p.sample_period + 0.5)
+        return self._samples[min(index, len(self._samples) - 1)]
+
+
+def read_reference_file(p: Parameters) -> tuple[float, ...]:
+    """Values of the CSV with header t,y_m and a row per sample period; () for other waveforms."""
+    if p.waveform != 'file':
+        return ()
+    if not p.file:
+        raise ParameterError('file', '', 'must name a CSV with rows t,y_m for waveform: file')
+    try:
+        with Path(p.file).open(newline='', encoding='utf-8') as file:
+            header, *rows = list(csv.reader(file)) or [[]]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ParameterError('file', p.file, f'cannot be read: {error}') from None
+    if [cell.strip() for cell in header] != ['t', 'y_m']:
+        raise ParameterError('file', p.file, 'must begin with the header t,y_m')
+    samples: list[float] = []
+    for line, row in enumerate(rows, start=2):
+        try:
+            t, y_m = map(float, row)
+        except ValueError:
+            raise ParameterError('file', p.file, f'line {line} must hold t,y_m') from None
+        due = len(samples) * p.sample_period
+        # A file in decimals rounds a little away.
+        if not (abs(t - due) <= 1e-3 * p.sample_period and isfinite(y_m)):
+            raise ParameterError(
+                'file', p.file, f'line {line} must hold t={due:.9g} and a finite y_m',
+                f'one row per sample_period={p.sample_period!r}')
+        samples.append(y_m)
+    return tuple(samples)
 
 
 def build_reference(p: Parameters) -> ReferenceSignal:

@@ -16,8 +16,7 @@ from backlash_ros import topics
 from backlash_ros.core.loop.reference_pace import ReferencePace
 from backlash_ros.core.loop.sample_counter import Output, SampleCounter
 from backlash_ros.core.parameters import REFERENCE_NODE, Parameters
-from backlash_ros.core.reference.signal import PERIODIC
-from backlash_ros.core.scenario import build_reference
+from backlash_ros.core.scenario import PERIODIC, build_reference
 from backlash_ros.nodes.runtime import messages
 from backlash_ros.nodes.runtime.driver_io import DriverIo
 from backlash_ros.nodes.runtime.executor import PromptExecutor, serve_polled

@@ -10,7 +10,7 @@ from reporting import ROOT, Array
 from scipy.signal import cont2discrete, lfilter
 
 from backlash_ros.core import Parameters, build_closed_loop
-from backlash_ros.core.reference.signal import ReferenceSignal
+from backlash_ros.core.scenario import ReferenceSignal
 from backlash_ros.core.simulation.closed_loop import ClosedLoop
 from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.tools.config import read_configuration

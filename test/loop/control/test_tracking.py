@@ -21,7 +21,7 @@ from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import TrackingWeights
 from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
-from backlash_ros.core.reference.signal import ReferenceSignal
+from backlash_ros.core.scenario import ReferenceSignal
 from backlash_ros.core.simulation import run_record
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 

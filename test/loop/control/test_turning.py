@@ -15,7 +15,7 @@ from backlash_ros.core.control.tracking.trajectory import IdealTrajectory
 from backlash_ros.core.parameters.table import TrackingWeights
 from backlash_ros.core.plant.backlash import Region
 from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
-from backlash_ros.core.reference.signal import ReferenceSignal
+from backlash_ros.core.scenario import ReferenceSignal
 from backlash_ros.core.simulation.run_record import turns
 
 Array = NDArray[np.float64]

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from backlash_ros.core.loop.reference_pace import ReferencePace
 from backlash_ros.core.loop.sample_counter import SampleCounter
 from backlash_ros.core.parameters import BY_NAME, ParameterError, Parameters
-from backlash_ros.core.reference.signal import ReferenceSignal
+from backlash_ros.core.scenario import ReferenceSignal
 
 OMEGA = 2.0 * pi  # a period of one second
 

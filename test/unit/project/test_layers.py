@@ -17,7 +17,7 @@ SHARED = {
 LAYERS = ('core', 'bags', 'nodes', 'tools')
 # Each room of the core imports from those before it only; likewise the parts of estimation.
 ROOMS = (
-    'jobs', 'parameters', 'plant', 'reference', 'estimate', 'law', 'laws', 'estimation', 'control',
+    'jobs', 'parameters', 'plant', 'estimate', 'law', 'laws', 'estimation', 'control',
     'scenario', 'assembly', 'loop', 'records', 'simulation', 'record_fit',
     'identification', 'driver_check',
 )

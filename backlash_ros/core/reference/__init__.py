@@ -1,1 +1,0 @@
-"""y_m(t), from a formula or from a file."""
