@@ -6,7 +6,7 @@ With the file a controller that is restarted need not learn from nothing.
 import json
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from math import inf, isfinite, isnan, nan
+from math import isnan, nan
 from pathlib import Path
 from typing import Any
 
@@ -121,16 +121,14 @@ def load_estimate(p: Parameters) -> Estimate | None:
         raise refused('must name a file for estimates.load: true', '')
     try:
         content = json.loads(Path(name).read_text(encoding='utf-8'))
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError) as error:
-        raise refused(f'cannot be read: {error}', 'delete it or name another one') from None
-    try:
         version, key, values = content['version'], dict(content['key']), content['estimate']
         numbers: Any = [nan if values[part] is None else float(values[part])
                         for part in (*NEEDED, *DEVIATIONS)]
-    except (KeyError, TypeError, ValueError):
-        raise refused('holds no saved estimates', 'delete it or name another one') from None
+    except FileNotFoundError:
+        return None
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise refused(f'holds no saved estimates ({error})', 'delete it or name another one') \
+            from None
     estimate = Estimate(*numbers)
     if version != 1:
         raise refused(f'has format {version!r}, not 1')
@@ -142,9 +140,7 @@ def load_estimate(p: Parameters) -> Estimate | None:
                           'name another file or set estimates.load: false')
     for part in NEEDED:
         value = getattr(estimate, part)
-        low, high = getattr(p.estimator.bounds, part, (-inf, inf))
-        if not isfinite(value):
-            raise refused(f'has no finite {part}')
+        low, high = getattr(p.estimator.bounds, part, (-1e100, 1e100))
         if not low <= value <= high:
             raise refused(f'has {part}={value!r} outside of estimator.bounds.{part}')
     if estimate.c_l > estimate.c_r:

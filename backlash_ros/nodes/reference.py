@@ -13,8 +13,7 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
-from backlash_ros.core.loop.reference_pace import ReferencePace
-from backlash_ros.core.loop.sample_counter import Output, SampleCounter
+from backlash_ros.core.loop.sample_counter import Output, ReferencePace, SampleCounter
 from backlash_ros.core.parameters import REFERENCE_NODE, Parameters
 from backlash_ros.core.scenario import PERIODIC, build_reference
 from backlash_ros.nodes.runtime import messages

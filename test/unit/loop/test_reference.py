@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from backlash_ros.core.loop.reference_pace import ReferencePace
-from backlash_ros.core.loop.sample_counter import SampleCounter
+from backlash_ros.core.loop.sample_counter import ReferencePace, SampleCounter
 from backlash_ros.core.parameters import BY_NAME, ParameterError, Parameters
 from backlash_ros.core.scenario import ReferenceSignal
 
@@ -57,7 +56,7 @@ def test_file_plays_sample_k_at_the_kth_period_whatever_the_rounding(k, period):
 
 
 @pytest.mark.parametrize(('text', 'complaint'), [
-    ('', 'header t,y_m'), ('t,y_m\n0,1,2\n', 'line 2 must hold t,y_m'),
+    ('', 'header t,y_m'), ('t,y_m\n0,1,2\n', 'line 2 must hold t=0 and a finite y_m'),
     ('t,y_m\n0,1\n0.02,2\n', 'line 3 must hold t=0.01'),
     ('t,y_m\n0,nan\n', 'finite y_m'), ('t,y_m\n', 'at least one sample'),
 ])
