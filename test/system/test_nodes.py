@@ -49,7 +49,7 @@ def test_bad_input_ends_a_node_with_one_line_and_exit_code_2(tmp_path: Path) -> 
     cases: list[tuple[str, list[str], str]] = [
         ('controller', ['-p', 'sample_period:=-0.01'], 'sample_period=-0.01 must be > 0 [s]'),
         ('controller', ['-p', 'estimator.use_applied_control:=1'],
-         'estimator.use_applied_control=1 must be a text'),
+         'estimator.use_applied_control=1 must be one of auto, true, false'),
         ('controller', ['--params-file', str(tmp_path / 'unknown.yaml')],
          'did you mean estimator.initial.m?'),
         ('plant', ['--params-file', str(tmp_path / 'unreadable.yaml')],

@@ -118,19 +118,15 @@ def check_value(parameter: Parameter, value: object) -> Value:
     default, refused = parameter.default, partial(ParameterError, parameter.name)
     if isinstance(default, tuple):
         return _checked_list(parameter, value)
-    if isinstance(default, bool) or 'true' in parameter.choices:
-        # YAML and ROS 2 take true and false for more than words.
-        value = str(value).lower() if isinstance(value, (bool, str)) else value
-    if isinstance(default, bool):
-        if value not in ('true', 'false'):
-            raise refused(value, 'must be true or false')
-        return value == 'true'
-    if isinstance(default, str):
+    if isinstance(default, (bool, str)):
+        words = ('true', 'false') if isinstance(default, bool) else tuple(parameter.choices)
+        if 'true' in words and isinstance(value, (bool, str)):
+            value = str(value).lower()  # YAML and ROS 2 take true and false for more than words
+        if words and value not in words:
+            raise refused(value, f'must be one of {", ".join(words)}')
         if not isinstance(value, str):
             raise refused(value, 'must be a text')
-        if parameter.choices and value not in parameter.choices:
-            raise refused(value, 'must be one of ' + ', '.join(parameter.choices))
-        return parameter.choices.get(value, value)
+        return value == 'true' if isinstance(default, bool) else parameter.choices.get(value, value)
     number = _number(parameter, value)
     if isinstance(default, float):
         return number
