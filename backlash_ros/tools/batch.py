@@ -6,7 +6,7 @@ import multiprocessing
 import os
 import signal
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import CancelledError, ProcessPoolExecutor, wait
+from concurrent.futures import CancelledError, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from itertools import product
 from math import inf
@@ -118,15 +118,11 @@ def _in_processes(jobs: Sequence[Job], workers: int) -> Iterator[Outcome]:
         with cli.StopRequests() as held:
             # Workers inherit for good what is blocked: a Ctrl-C is for their parent alone.
             signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
-            futures = [executor.submit(run_job, job) for job in jobs]
+            outcomes = executor.map(run_job, jobs)
             signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
         if held.count:
             raise KeyboardInterrupt
-        for future in futures:
-            # A signal that comes just before a wait is only noticed after it: none is without end.
-            while not wait([future], 0.5).done:
-                pass
-            yield future.result()
+        yield from outcomes
     except BrokenProcessPool:
         raise BrokenOffError('a worker process was killed: is there enough memory?') from None
     finally:
