@@ -9,12 +9,12 @@ import numpy as np
 
 from backlash_ros.core.records.record import Record, RecordError
 from backlash_ros.core.records.time_grid import record_of
-from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
+from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.tools.cli import WHOLE_SPAN, InputError, Span
 from backlash_ros.tools.config import effective_parameters
 from backlash_ros.tools.records.columns import COMMAND, choose_columns
 from backlash_ros.tools.records.table import read_table
-from backlash_ros.tools.runs.files import SAMPLE_COLUMNS, Run
+from backlash_ros.tools.runs.files import SAMPLE_COLUMNS, Run, rows_of
 
 NO_COLUMNS: Mapping[str, str] = {}
 
@@ -100,10 +100,8 @@ def read_run_or_log(
     known = np.flatnonzero(np.isfinite(record.y))
     applied = [[], *(part.tolist() for part in np.split(record.v, known)[1:-1])]
     # A log names no reference, and what is learned does not depend on it.
-    rows = np.full((len(known), len(COLUMNS)), np.nan)
-    rows[:, [COLUMNS.index(name) for name in ('t', 'y_m', 'y', 'v')]] = np.column_stack(
-        [record.sample_period * (known - known[0]), record.y[known], record.y[known],
-         record.v[known]])
+    rows = rows_of({'t': record.sample_period * (known - known[0]), 'y_m': record.y[known],
+                    'y': record.y[known], 'v': record.v[known]})
     run_record = RunRecord(
         rows, record.sample_period, int(known[-1] - known[0] + 1 - len(known)))
     return Run(run_record, parameters, None, (record.timing, *record.notes)), applied
