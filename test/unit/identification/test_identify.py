@@ -139,7 +139,7 @@ def test_an_axis_gets_a_file_of_its_own(tmp_path, capsys):
     source = write_csv(tmp_path / 'a.csv', *record(800))
     given = [str(source), *QUICK, '--config', str(config), '--out', str(tmp_path / 'out')]
     assert main(given) == 2
-    assert 'choose it, like --axis x' in capsys.readouterr().err
+    assert 'must be one of x, z: choose it with --axis' in capsys.readouterr().err
     assert main([*given, '--axis', 'z']) == 0
     found = effective_parameters(tmp_path / 'out' / 'identified.yaml', axis='z')
     assert found.control.max == 5.0
