@@ -155,7 +155,7 @@ def on_grid(rows: Rows, period: float | None = None, late: bool = False) -> Reco
     guess = period or (stamps.typical_step(rows.t) if late else _period(rows.t))
     rows, cut = _longest_stretch(rows, guess)
     if len(rows.t) < 2 or not np.isfinite(rows.y).any():
-        raise RecordError(f'{cut}but y holds no motion there: cut out one with --from, --to')
+        raise RecordError(f'{cut}y holds no motion there: cut out one with --from, --to')
     steps = np.diff(rows.t) / guess
     found = _numbering(rows.t, steps, guess, late)
     used = period or found.period

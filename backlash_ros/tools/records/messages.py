@@ -84,7 +84,7 @@ def from_messages(heard: Mapping[str, Messages], period: float | None, of_axis: 
     for topic, (times, _) in sent.items():
         lost = np.count_nonzero((t > times[0] - step) & (t <= times[-1])) - len(times)
         # A topic with fewer messages is published on change.
-        if TROUBLE < lost / (lost + len(times)) < 0.5:
+        if TROUBLE * (lost + len(times)) < lost < 0.5 * (lost + len(times)):
             notes.append(f'{lost} messages of {topic} are missing: the one before is taken for '
                          'them')
             record = replace(record, commands=None)
