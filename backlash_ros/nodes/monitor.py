@@ -13,6 +13,7 @@ import time
 import tty
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from io import TextIOWrapper
 from math import isfinite
 from typing import Any
 
@@ -49,6 +50,8 @@ class MonitorNode(ViewerNode):
         self._client_of: dict[str, Client] = {}
 
     def work(self, executor: PromptExecutor) -> None:
+        if isinstance(sys.stdout, TextIOWrapper):
+            sys.stdout.reconfigure(errors='replace')  # whatever a terminal cannot show
         console = Console()
         try:
             if console.is_terminal and not console.is_dumb_terminal:

@@ -21,6 +21,7 @@ from std_msgs.msg import Float64MultiArray
 from backlash_ros import topics
 from backlash_ros.bags import REPAIR_COMMAND, Bag, RecordingError, repair_command
 from backlash_ros.core.loop.diagnosis import Finding, Level
+from backlash_ros.core.loop.sample_counter import UNNUMBERED
 from backlash_ros.core.parameters import RECORDER
 from backlash_ros.nodes.runtime import messages
 from backlash_ros.nodes.runtime.driver_io import driver_topics, output_qos
@@ -37,6 +38,8 @@ class RecordedTopic:
     connection: Any = None  # of the bag, if there is one
     newest: bytes = b''  # serialised
     received: int = 0
+    missed: int = 0
+    sequence: int = UNNUMBERED  # of the newest message
 
     def row(self, labels: Sequence[str]) -> dict[str, float]:
         """The newest message of an array topic by label, without more than the first joint."""
@@ -108,6 +111,10 @@ class RecorderNode(ProcessNode):
         if self.failure:
             self.log.warning(f'{self._unrecorded} messages came after the recording had stopped')
         channels = self._channels.values()
+        for channel in channels:
+            if channel.missed:
+                name = channel.subscription.topic_name
+                self.log.warning(f'{channel.missed} messages of {name} were missed')
         emit('closed', messages={each.subscription.topic_name: each.received for each in channels})
 
     @property
@@ -163,7 +170,11 @@ class RecorderNode(ProcessNode):
     def _on_message(self, topic: str, message: bytes, info: dict[str, Any]) -> None:
         channel = self._channels[topic]
         channel.received += 1
-        channel.newest = message
+        channel.newest, sequence = message, info['publication_sequence_number']
+        # Each of several publishers has numbers of its own.
+        if UNNUMBERED not in (sequence, channel.sequence) and topic != topics.DIAGNOSTICS:
+            channel.missed += max(sequence - channel.sequence - 1, 0)
+        channel.sequence = sequence
         stamp_ns = info['source_timestamp'] if self._now_ns is None else self._now_ns
         self._with_bag(lambda bag: bag.write(channel.connection, stamp_ns, message))
         self._unrecorded += self._bag is None
