@@ -41,7 +41,7 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
                         'every sample waiting for its control, instead of real time')
     parser.add_argument('--record', action=argparse.BooleanOptionalAction, default=True,
                         help='record a bag and write a report from it')
-    parser.add_argument('--live', action='store_const', const=0, dest='live_port',
+    parser.add_argument('--live', action='store_true',
                         help='show the loop on a page in the browser; its address is printed')
     parser.add_argument('--live-port', type=port, metavar='PORT', help='the same on this port')
     return parser.parse_args(arguments)
@@ -53,7 +53,8 @@ def _bringup(arguments: Sequence[str] | None) -> int:
     from backlash_ros.tools.bringup.plan import prepare
     from backlash_ros.tools.bringup.watch import report, run
     axes = prepare(options)
-    failure = run(axes, options.record, options.live_port)
+    live_port = options.live_port or (0 if options.live else None)
+    failure = run(axes, options.record, live_port)
     reported = [axis.made > 0 and report(axis, options.record) for axis in axes]
     return DONE if all(reported) and not failure else FAILED
 

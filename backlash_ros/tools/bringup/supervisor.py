@@ -101,6 +101,9 @@ class Child:
 
     def start(self, environment: Mapping[str, str]) -> None:
         """Raises BrokenOffError for a program that cannot be started."""
+        # A node lets them through when it knows what to do with them: see nodes/__init__.py.
+        held_back = () if self.foreign else (signal.SIGINT, signal.SIGTERM)
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, held_back)
         try:
             with self.log.open('ab') as log:
                 self.process = subprocess.Popen(
@@ -110,6 +113,8 @@ class Child:
         except OSError as error:
             raise BrokenOffError(f'{self.name} does not start: {self.command[0]}: '
                                  f'{error.strerror}') from error
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def pass_on(self, events: 'SimpleQueue[tuple[Child, dict[str, Any]]]') -> None:
         """Read its output: the events of nodes/runtime/process.py go on, all else is logged."""
