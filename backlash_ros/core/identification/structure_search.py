@@ -129,7 +129,7 @@ def searched(
                        units.y_size * chosen.trained.rms)
     return StructureSearch(
         samples, compared, chosen, best, rivals, held_out, delays, by_model(best.gap, [
-            (one.whole.gap, one.criterion - chosen.criterion) for one in compared]))
+            (one.whole.gap, one.criterion - chosen.criterion) for one in _eligible(compared)]))
 
 
 def _with_general(samples: Samples, delays: Sequence[int]) -> list[Model]:
