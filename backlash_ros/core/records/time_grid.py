@@ -166,7 +166,8 @@ def on_grid(rows: Rows, period: float | None = None, late: bool = False) -> Reco
                               f'{cut}{len(rows.t)} {what}, one every {seconds(used)}')
     inner = steps[steps <= BREAK * max(float(np.median(steps)), 1.0)]
     mean = float(np.mean(inner))
-    come = f'{cut}stamps come every {seconds(mean * guess)} ± {np.std(inner) / mean:.2%}'
+    percent = f'{100.0 * float(np.std(inner)) / mean:.2g} %'
+    come = f'{cut}stamps jitter by {percent} around {seconds(mean * guess)}'
     if period is not None:
         found = _along(_late_numbers(rows.t / period), rows.t)
     # Too many may be missing, or too late, to be numbered.
