@@ -23,7 +23,7 @@ from backlash_ros.core.law import Law
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.laws.gradient import GradientEstimator
 from backlash_ros.core.laws.input_reconstruction import InputReconstruction
-from backlash_ros.core.laws.lagged_laws import NormalisedLms, PrintedLaw
+from backlash_ros.core.laws.lms_and_printed import NormalisedLms, PrintedLaw
 from backlash_ros.core.parameters import BY_NAME, ParameterError, Parameters
 from backlash_ros.core.plant.numerics import FourBlocks, place_poles
 from backlash_ros.core.plant.transfer_function import (

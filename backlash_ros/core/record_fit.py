@@ -8,12 +8,12 @@ import numpy as np
 
 from backlash_ros.core.estimate import Bounds
 from backlash_ros.core.estimation import explanations, settings
-from backlash_ros.core.estimation.fit import Window
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.posterior import WindowFit
 from backlash_ros.core.plant.transfer_function import Array, StateModel, TransferFunction
 from backlash_ros.core.records.readings import check_record, outliers
 from backlash_ros.core.simulation.run_record import turns
+from backlash_ros.core.window import Window
 
 
 class RecordFit(NamedTuple):

@@ -10,7 +10,7 @@ import numpy as np
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.structure import Command, ControlInput, Proportional
 from backlash_ros.core.estimate import Estimate
-from backlash_ros.core.laws.lagged_laws import printed_c, printed_f, printed_m
+from backlash_ros.core.laws.lms_and_printed import printed_c, printed_f, printed_m
 from backlash_ros.core.plant.backlash import Backlash
 
 PERIOD = 0.01

@@ -10,10 +10,11 @@ import numpy as np
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.estimation import settings
 from backlash_ros.core.estimation.explanations import Setup
-from backlash_ros.core.estimation.fit import Problem, Window
+from backlash_ros.core.estimation.fit import Problem
 from backlash_ros.core.estimation.posterior import Prior, WindowFit
 from backlash_ros.core.plant.backlash import Region, engaged, reversals
 from backlash_ros.core.plant.transfer_function import Array
+from backlash_ros.core.window import Window
 
 
 class State(Enum):

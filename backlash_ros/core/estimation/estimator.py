@@ -15,7 +15,6 @@ from backlash_ros.core.estimate import Bounds, Estimate, Status
 from backlash_ros.core.estimation import settings
 from backlash_ros.core.estimation.belief import Belief, Kept, Known
 from backlash_ros.core.estimation.explanations import Setup
-from backlash_ros.core.estimation.fit import Window
 from backlash_ros.core.estimation.observer import Following, Gain, Place, gains_of, state_after
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.state_machine import learn
@@ -24,6 +23,7 @@ from backlash_ros.core.law import Interval, Law, LawReport
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.transfer_function import Array, StateModel, TransferFunction
+from backlash_ros.core.window import Recorder, Window
 
 
 class Proposal(NamedTuple):
@@ -40,29 +40,6 @@ class Fitted(NamedTuple):
     belief: Belief
     place: Place | None = None
     better: Proposal | None = None
-
-
-class Recorder:
-    """Samples of the loop, the newest `capacity` at least; end: number of the next one."""
-
-    def __init__(self, capacity: int) -> None:
-        self.end, self._capacity = 0, capacity
-        self._kept = Window(0, *np.empty((3, 2 * capacity)))
-
-    def append(self, v: float, y: float, other: float) -> None:
-        kept, at = self._kept, self.end - self._kept.first
-        if at == len(kept.v):
-            # Into other arrays: a fit may be looking at these.
-            first, *newest = kept.between(self.end - self._capacity)
-            doubled = (np.concatenate([each, np.empty_like(each)]) for each in newest)
-            kept, at = Window(first, *doubled), self._capacity
-            self._kept = kept
-        kept.v[at], kept.y[at], kept.other[at] = v, y, other
-        self.end += 1
-
-    def since(self, first: int) -> Window:
-        """The samples from a number on, as far as they are there; they do not change any more."""
-        return self._kept.between(first, self.end)
 
 
 def fitted(

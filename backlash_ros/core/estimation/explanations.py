@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Bounds
 from backlash_ros.core.estimation import settings
-from backlash_ros.core.estimation.fit import FEW_STEPS, FIRST_STEPS, Problem, Window
+from backlash_ros.core.estimation.fit import FEW_STEPS, FIRST_STEPS, Problem
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.posterior import Prior, WindowFit
 from backlash_ros.core.estimation.search import search
 from backlash_ros.core.estimation.unmodelled import with_walk
 from backlash_ros.core.law import OutOfBounds
 from backlash_ros.core.plant.transfer_function import Array
+from backlash_ros.core.window import Window
 
 
 @dataclass(frozen=True)

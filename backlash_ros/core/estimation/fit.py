@@ -42,44 +42,6 @@ class Run(NamedTuple):
     begins: NDArray[np.intp]
 
 
-class Window(NamedTuple):
-    """Samples from number `first` on: v that acted, y after it (nan: lost), v that may have acted
-    instead (nan: none), all (N,)."""
-
-    first: int
-    v: Array
-    y: Array
-    other: Array
-
-    @property
-    def end(self) -> int:
-        return self.first + len(self.v)
-
-    def between(self, first: int, end: int | None = None) -> 'Window':
-        """The samples from one number to before another."""
-        begin = max(first - self.first, 0)
-        part = slice(begin, None if end is None else max(end - self.first, 0))
-        return Window(self.first + begin, self.v[part], self.y[part], self.other[part])
-
-    def places(self, numbers: frozenset[int]) -> list[int]:
-        return [k - self.first for k in numbers if self.first <= k < self.end]
-
-    def swapped(self, numbers: frozenset[int]) -> 'Window':
-        """The same where the other command acted over the intervals of these samples."""
-        places, v, other = self.places(numbers), self.v.copy(), self.other.copy()
-        v[places], other[places] = self.other[places], self.v[places]
-        return self._replace(v=v, other=other)
-
-    def without(self, numbers: frozenset[int]) -> 'Window':
-        """The same without these readings."""
-        y = self.y.copy()
-        y[self.places(numbers)] = np.nan
-        return self._replace(y=y)
-
-    def turns(self, gap: float, p0: float) -> int:
-        return len(reversals(engaged(self.v, play(self.v, gap, p0), gap)))
-
-
 class Problem:
     """A record v, y (N,), y nan where lost, with what is known beside it.
 

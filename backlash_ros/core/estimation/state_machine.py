@@ -20,10 +20,12 @@ from backlash_ros.core.estimate import Status
 from backlash_ros.core.estimation import settings
 from backlash_ros.core.estimation.belief import Belief, Known, State, Trial, shortened
 from backlash_ros.core.estimation.explanations import Setup, afresh, mixed, outliers
-from backlash_ros.core.estimation.fit import FEW_STEPS, Problem, Window
+from backlash_ros.core.estimation.fit import FEW_STEPS, Problem
+from backlash_ros.core.estimation.late_commands import likelier
 from backlash_ros.core.estimation.posterior import Prior, WindowFit, agree
 from backlash_ros.core.estimation.settings import BLOCKS, FEWEST, MISFIT, PREDICTED, SHORT_RECORD
-from backlash_ros.core.estimation.unmodelled import coasts, likelier, with_walk
+from backlash_ros.core.estimation.unmodelled import coasts, with_walk
+from backlash_ros.core.window import Window
 
 
 def learn(setup: Setup, record: Window, before: Belief) -> Belief:

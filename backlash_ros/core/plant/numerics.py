@@ -164,3 +164,8 @@ class NoiseLevel:
             del self._sorted[bisect_left(self._sorted, self._sizes[0])]
         self._sizes.append(size)
         insort(self._sorted, size)
+
+
+def basis(columns: Array) -> Array:
+    """Orthonormal columns (N, P) that span the same space as these (N, P)."""
+    return np.linalg.qr(columns / np.maximum(np.abs(columns).max(axis=0), 1e-300))[0]

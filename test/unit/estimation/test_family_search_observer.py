@@ -9,7 +9,6 @@ from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR
 
 from backlash_ros.core.estimate import Bounds
 from backlash_ros.core.estimation.explanations import Setup, afresh
-from backlash_ros.core.estimation.fit import Window
 from backlash_ros.core.estimation.observer import RATIOS, gain_of
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.posterior import independence, likelihood, mean_information
@@ -18,6 +17,7 @@ from backlash_ros.core.plant.backlash import play
 from backlash_ros.core.plant.numerics import lfilter
 from backlash_ros.core.plant.simulated_plant import altered_plant
 from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
+from backlash_ros.core.window import Window
 
 PLANTS = {
     'one pole': ([0.3], [1.0, -0.7]), 'integrator': ([0.1], [1.0, -1.7, 0.7]),

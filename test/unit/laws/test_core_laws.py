@@ -12,7 +12,7 @@ from backlash_ros.core.assembly import build_controller, build_plant, build_refe
 from backlash_ros.core.estimate import Bounds, Estimate, Status
 from backlash_ros.core.law import Interval
 from backlash_ros.core.laws.input_reconstruction import InputReconstruction
-from backlash_ros.core.laws.lagged_laws import PrintedLaw, printed_c, printed_f, printed_m
+from backlash_ros.core.laws.lms_and_printed import PrintedLaw, printed_c, printed_f, printed_m
 from backlash_ros.core.parameters import ParameterError, Parameters
 from backlash_ros.core.plant.transfer_function import TransferFunction
 from backlash_ros.core.simulation.closed_loop import build_closed_loop

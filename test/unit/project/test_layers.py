@@ -17,13 +17,13 @@ SHARED = {
 LAYERS = ('core', 'bags', 'nodes', 'tools')
 # Each room of the core imports from those before it only; likewise the parts of estimation.
 ROOMS = (
-    'jobs', 'parameters', 'plant', 'estimate', 'law', 'laws', 'estimation', 'control',
+    'jobs', 'parameters', 'plant', 'window', 'estimate', 'law', 'laws', 'estimation', 'control',
     'scenario', 'assembly', 'loop', 'records', 'simulation', 'record_fit',
     'identification', 'driver_check',
 )
 ESTIMATION = (
-    'settings', 'plant_family', 'posterior', 'fit', 'unmodelled', 'search', 'explanations',
-    'belief', 'state_machine', 'observer', 'estimator',
+    'settings', 'plant_family', 'posterior', 'fit', 'unmodelled', 'late_commands', 'search',
+    'explanations', 'belief', 'state_machine', 'observer', 'estimator',
 )
 NUMERIC = {'numpy', 'scipy'}
 ROS_SUFFIXES = ('_msgs', '_srvs', '_interfaces')

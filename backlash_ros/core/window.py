@@ -1,0 +1,69 @@
+"""Samples of a loop: a window of them, to which a backlash is fitted, and what keeps the newest."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from backlash_ros.core.plant.backlash import engaged, play, reversals
+from backlash_ros.core.plant.transfer_function import Array
+
+
+class Window(NamedTuple):
+    """Samples from number `first` on: v that acted, y after it (nan: lost), v that may have acted
+    instead (nan: none), all (N,)."""
+
+    first: int
+    v: Array
+    y: Array
+    other: Array
+
+    @property
+    def end(self) -> int:
+        return self.first + len(self.v)
+
+    def between(self, first: int, end: int | None = None) -> 'Window':
+        """The samples from one number to before another."""
+        begin = max(first - self.first, 0)
+        part = slice(begin, None if end is None else max(end - self.first, 0))
+        return Window(self.first + begin, self.v[part], self.y[part], self.other[part])
+
+    def places(self, numbers: frozenset[int]) -> list[int]:
+        return [k - self.first for k in numbers if self.first <= k < self.end]
+
+    def swapped(self, numbers: frozenset[int]) -> 'Window':
+        """The same where the other command acted over the intervals of these samples."""
+        places, v, other = self.places(numbers), self.v.copy(), self.other.copy()
+        v[places], other[places] = self.other[places], self.v[places]
+        return self._replace(v=v, other=other)
+
+    def without(self, numbers: frozenset[int]) -> 'Window':
+        """The same without these readings."""
+        y = self.y.copy()
+        y[self.places(numbers)] = np.nan
+        return self._replace(y=y)
+
+    def turns(self, gap: float, p0: float) -> int:
+        return len(reversals(engaged(self.v, play(self.v, gap, p0), gap)))
+
+
+class Recorder:
+    """Samples of the loop, the newest `capacity` at least; end: number of the next one."""
+
+    def __init__(self, capacity: int) -> None:
+        self.end, self._capacity = 0, capacity
+        self._kept = Window(0, *np.empty((3, 2 * capacity)))
+
+    def append(self, v: float, y: float, other: float) -> None:
+        kept, at = self._kept, self.end - self._kept.first
+        if at == len(kept.v):
+            # Into other arrays: a fit may be looking at these.
+            first, *newest = kept.between(self.end - self._capacity)
+            doubled = (np.concatenate([each, np.empty_like(each)]) for each in newest)
+            kept, at = Window(first, *doubled), self._capacity
+            self._kept = kept
+        kept.v[at], kept.y[at], kept.other[at] = v, y, other
+        self.end += 1
+
+    def since(self, first: int) -> Window:
+        """The samples from a number on, as far as they are there; they do not change any more."""
+        return self._kept.between(first, self.end)
