@@ -77,19 +77,23 @@ def test_reports_of_an_encoder_with_another_zero_still_teach_the_crossings_of_v(
 
 
 def test_lost_controls_that_nobody_reports_are_said_to_be_inconsistent() -> None:
-    world = SimulatedLoop()
-    world.learn()
-    world.deaf = lambda: bool(world.rng.random() < 0.3)
-    world.run(600)
-    rows = world.rows[-600:]
-    assert np.mean([row.status is Status.INCONSISTENT for row in rows]) > 0.2
-    off = np.abs([[row.m, row.c_r, row.c_l] for row in rows] - TRUTH)
-    beyond = off > 5.0 * np.array([[row.std_m, row.std_c_r, row.std_c_l] for row in rows])
-    tracking = np.array([row.status is Status.TRACKING for row in rows])
-    assert np.mean(tracking & beyond.any(axis=1)) < 0.05
-    # What is lost looks like a disturbance that walks: both crossings move, and say so.
-    assert (off / np.abs(TRUTH)).max() < 0.6
-    world.check_sanity()
+    wrong = []
+    for seed in (3, 5, 7):
+        world = SimulatedLoop()
+        world.learn()
+        world.rng = np.random.default_rng(seed)
+        world.deaf = lambda world=world: bool(world.rng.random() < 0.3)
+        world.run(600)
+        rows = world.rows[-600:]
+        assert np.mean([row.status is Status.INCONSISTENT for row in rows]) > 0.2
+        off = np.abs([[row.m, row.c_r, row.c_l] for row in rows] - TRUTH)
+        beyond = off > 5.0 * np.array([[row.std_m, row.std_c_r, row.std_c_l] for row in rows])
+        tracking = np.array([row.status is Status.TRACKING for row in rows])
+        wrong.append(np.mean(tracking & beyond.any(axis=1)))
+        # What is lost looks like a disturbance that walks: both crossings move, and say so.
+        assert (off / np.abs(TRUTH)).max() < 0.6
+        world.check_sanity()
+    assert np.mean(wrong) < 0.03
 
 
 @pytest.mark.parametrize('broken', ['sign', 'constant'])
