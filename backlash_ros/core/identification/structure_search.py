@@ -39,6 +39,7 @@ EARLY, LONGEST_DELAY = (0, 1, 2, 3), 40  # delays that are compared first, and t
 GENERAL_POLES = 3  # of the G with which the gap is searched first; it has a tap for each delay
 HELD_OUT = 1.0 / 3.0  # share of the record, its last
 PLATEAU = 10.0  # difference of the criterion below which two delays are equally good
+ALIKE = 1.1  # ratio of residuals up to which structures explain about as much
 EXACT = 1e-10  # rms over that of y, less than which no error counts: simulations round
 
 
@@ -212,13 +213,18 @@ def _compare(
     return compared
 
 
-def selected(compared: Sequence[Compared]) -> Compared:
-    """The structure that is taken."""
+def predictors(compared: Sequence[Compared]) -> list[Compared]:
+    """The structures that predict about as well as any."""
     eligible = _eligible(compared)
     needed = [one for one in eligible if not gives_way(one.whole, eligible)]
     least = min(needed, key=lambda one: one.held_out)
     within = least.held_out * max(1.05, 1.0 + least.scatter)
-    return min((one for one in needed if one.held_out <= within), key=lambda one: one.criterion)
+    return [one for one in needed if one.held_out <= within]
+
+
+def selected(compared: Sequence[Compared]) -> Compared:
+    """The structure that is taken."""
+    return min(predictors(compared), key=lambda one: one.criterion)
 
 
 def _eligible(compared: Sequence[Compared]) -> list[Compared]:
