@@ -24,7 +24,8 @@ def coasts(problem: Problem, fit: WindowFit, known: Array | None = None) -> bool
     known: m, c_r, c_l (3,) from before, for the fit of a load that coasts may have next to no gap.
     """
     named = 8.0  # kappa over its deviation, as residuals are far from white
-    if not (fit.m > 0.0 and fit.systematic):
+    matters = 2e-3  # unexplained motion over the gap, as rounding of a slow motion leaves less
+    if not (fit.m > 0.0 and fit.systematic and fit.unexplained > matters):
         return False
     if known is not None:
         m, c_r, c_l = known.tolist()
