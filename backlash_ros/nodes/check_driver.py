@@ -12,7 +12,6 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from functools import partial
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,6 @@ from typing import Any
 import numpy as np
 from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 from rclpy.qos import QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 from std_msgs.msg import Float64
@@ -28,7 +26,7 @@ from std_msgs.msg import Float64
 from backlash_ros import topics
 from backlash_ros.core import driver_check
 from backlash_ros.core.assembly import build_controller, build_limits
-from backlash_ros.core.control.limits import plausible
+from backlash_ros.core.control.limits import Limits, plausible
 from backlash_ros.core.control.motion import Drive, drive_limits
 from backlash_ros.core.parameters.table import CONTROLLER, RECORDER
 from backlash_ros.nodes.control.rivals import CommandLock
@@ -47,6 +45,121 @@ from backlash_ros.options import (
 LOOK_S = 0.1  # between two looks at the graph
 
 
+class MessageLog:
+    """All messages heard and sent; each is a line of a file as well where a path is given."""
+
+    def __init__(self, path: str | None) -> None:
+        self.heard = driver_check.Heard()
+        self._file = open(path or os.devnull, 'w', encoding='ascii')  # noqa: SIM115
+
+    def note(self, topic: str, message: driver_check.Message) -> None:
+        self.heard.by_topic[topic].append(message)
+        print(topic, message.stamp_ns, repr(message.value), sep=',', file=self._file)
+
+    def flush(self) -> None:
+        self._file.flush()
+
+
+class ActuatorDrive:
+    """Moves v: a control for every plant_output, from the v that acts, and to rest at the end.
+
+    It waits until everybody has found everybody and somebody listens. rivals: who else moves v.
+    ended: why the motion ended before its time.
+    """
+
+    def __init__(
+        self, node: ProcessNode, options: argparse.Namespace, limits: Limits, messages: MessageLog,
+    ) -> None:
+        self._node, self._options, self._limits, self._messages = node, options, limits, messages
+        self._motion: Drive | None = None  # v on its way
+        self._control = node.create_publisher(Float64, topics.CONTROL, DEPTH)
+        self._lock = CommandLock(
+            node.context.get_domain_id(), node.resolve_topic_name(topics.CONTROL))
+        self._settled_at = time.monotonic() + 1.0  # everybody found everybody
+        self._newest_at = inf  # the newest y came
+        self._answers = False
+        self.ended = self.rivals = ''
+
+    @property
+    def moved(self) -> bool:
+        """Whether v was moved at all."""
+        return self._motion is not None
+
+    @property
+    def over(self) -> bool:
+        """Whether v has had all the samples of the duration, late ones as well, or gets no more."""
+        duration_s = self._options.duration
+        enough = duration_s / self._node.settings.sample_period
+        return bool(self.ended or self.rivals) or len(self._messages.heard.controls) >= enough \
+            or time.monotonic() > self._settled_at + 2.0 * duration_s
+
+    def look(self) -> None:
+        """Take note of who else is there. Once heard, a rival counts, even if it leaves."""
+        rivals = {name_of(info) for info in publishers(self._node, topics.CONTROL)}
+        now, p = time.monotonic(), self._node.settings
+        if now > self._settled_at:
+            if not self._lock.take():
+                rivals = rivals or {'a controller of this machine'}
+            self._answers = self._control.get_subscription_count() > 0
+        self.rivals = self.rivals or ', '.join(sorted(rivals))
+        patience_s = max(p.timeout.plant_output, 10.0 * p.sample_period)
+        if self._answers and now > self._newest_at + patience_s:
+            output = self._node.resolve_topic_name(topics.PLANT_OUTPUT)
+            self.ended = f'nothing was heard on {output} for {patience_s:g} s'
+
+    def answer(self, y: float) -> None:
+        """Move v on by a sample, unless it has to wait or the motion has ended."""
+        self._newest_at = time.monotonic()
+        if self.rivals or not self._answers:
+            return
+        low, high = self._options.output_range or (-inf, inf)
+        if plausible(y) and not low <= y <= high:
+            self.ended = self.ended or f'y = {y:.4g} left --output-range'
+        if self.ended:
+            return
+        if self._motion is None:
+            self._motion = Drive(self._limits, self._node.settings.sample_period,
+                                 self._options.duration, self._v_at_start())
+        v, now = self._motion.step(), time.time_ns()
+        self._control.publish(Float64(data=v))
+        self._messages.note(topics.CONTROL, driver_check.Message(v, now, now, 0))
+
+    def _v_at_start(self) -> float:
+        """The v that acts before the motion, 0 where nobody says it."""
+        p = self._node.settings
+        known = p.control.initial if plausible(p.control.initial) else None
+        for message in self._messages.heard.applied[-1:]:
+            if plausible(message.value):
+                return build_limits(p).go_on_from(message.value, known)
+        if known is None:
+            say(self._node, 'nobody says which v acts now, so the drive goes on from 0: publish '
+                f'{topics.APPLIED_CONTROL}, or set control.initial')
+        return known or 0.0
+
+    def come_to_rest(self) -> None:
+        """Bring v to rest, or hold it where that takes too long or another signal comes."""
+        if self._motion is None:
+            return
+        node, rest_s = self._node, self._options.rest
+        before, deadline = len(node.signals), time.monotonic() + rest_s
+        v = self._messages.heard.controls[-1].value
+        for v in self._motion.to_rest():
+            self._control.publish(Float64(data=v))
+            time.sleep(node.settings.sample_period)
+            late = time.monotonic() > deadline
+            if late or len(node.signals) > before:
+                why = f'not at rest within --rest={rest_s:g} s' if late \
+                    else 'another signal came'
+                say(node, f'v is held at {v:.6g}: {why}')
+                break
+        # A busy machine may lose a message, and this one is to be heard before the node leaves.
+        for _ in range(10):
+            self._control.publish(Float64(data=v))
+            if self._control.wait_for_all_acked(Duration(seconds=0.1)):
+                return
+        say(node, f'the driver has not confirmed the last v={v:.6g}')
+
+
 class CheckDriverNode(ProcessNode):
     """Hears a driver and, with --drive, answers every plant_output with a control.
 
@@ -59,27 +172,18 @@ class CheckDriverNode(ProcessNode):
         p = self.settings
         build_controller(p)
         self._options = options
-        if options.drive:
-            limits = drive_limits(p, options.amplitude, options.rate)
-            self._begin = partial(Drive, limits, p.sample_period, options.duration)
-        self._motion: Drive | None = None  # v on its way
-        self._heard = driver_check.Heard()
-        self._file = open(options.messages or os.devnull, 'w', encoding='ascii')  # noqa: SIM115
+        self._limits = drive_limits(p, options.amplitude, options.rate) if options.drive else None
+        self._drive: ActuatorDrive | None = None  # once the driver is found
+        self._messages = MessageLog(options.messages)
         self._graph = driver_check.Graph()  # with the most of them that were there at once
-        self._control_topic = self.resolve_topic_name(topics.CONTROL)
-        self._output_topic = self.resolve_topic_name(topics.PLANT_OUTPUT)
-        self._lock = CommandLock(self.context.get_domain_id(), self._control_topic)
-        self._control: Publisher
-        self._answers = False
-        self._settled_at = self._newest_at = inf  # everybody found everybody; the newest y came
-        self._ended = self._rivals = ''  # why the motion ended before its time; who else moves v
 
     def work(self, executor: PromptExecutor) -> None:
         if self._finds_driver(executor):
             try:
                 self._follow(executor)
             finally:
-                self._come_to_rest()
+                if self._drive is not None:
+                    self._drive.come_to_rest()
         self.exit_code = self._tell()
 
     def _finds_driver(self, executor: PromptExecutor) -> bool:
@@ -92,125 +196,61 @@ class CheckDriverNode(ProcessNode):
         return found and not self.stopping
 
     def _follow(self, executor: PromptExecutor) -> None:
-        """Listen for the duration; drive for as many samples as it has, late ones as well."""
-        drives, duration_s = self._options.drive, self._options.duration
-        enough = duration_s / self.settings.sample_period if drives else inf
+        """Listen for the duration, or until the drive is over."""
         self._hear(topics.APPLIED_CONTROL)
-        if drives:
-            self._control = self.create_publisher(Float64, topics.CONTROL, DEPTH)
+        if self._limits is not None:
+            self._drive = ActuatorDrive(self, self._options, self._limits, self._messages)
         else:
             self._hear(topics.CONTROL)
         self._hear(topics.PLANT_OUTPUT)
-        now = time.monotonic()
-        self._settled_at = now + 1.0
-        end = now + duration_s if not drives else self._settled_at + 2.0 * duration_s
+        end = time.monotonic() + self._options.duration
         self.every(LOOK_S, self._look)
-        while not (self.stopping or self._ended or self._rivals or time.monotonic() > end
-                   or len(self._heard.controls) >= enough):
+        while not (self.stopping or (self._drive.over if self._drive else time.monotonic() > end)):
             executor.spin_once(timeout_sec=LOOK_S)
         self._look()
-        self._heard.end_ns = time.time_ns()
+        self._messages.heard.end_ns = time.time_ns()
 
     def _look(self) -> None:
-        """Take note of who is there. Once heard, a rival counts, even if it leaves."""
+        """Take note of who is there."""
         self._graph = max(graph_around(self), self._graph,
                           key=lambda graph: (graph.publishers, graph.listeners))
-        self._file.flush()
-        if not self._options.drive:
-            return
-        rivals = {name_of(info) for info in publishers(self, topics.CONTROL)}
-        now, p = time.monotonic(), self.settings
-        if now > self._settled_at:
-            if not self._lock.take():
-                rivals = rivals or {'a controller of this machine'}
-            self._answers = self._control.get_subscription_count() > 0
-        self._rivals = self._rivals or ', '.join(sorted(rivals))
-        patience_s = max(p.timeout.plant_output, 10.0 * p.sample_period)
-        if self._answers and now > self._newest_at + patience_s:
-            self._ended = f'nothing was heard on {self._output_topic} for {patience_s:g} s'
+        self._messages.flush()
+        if self._drive is not None:
+            self._drive.look()
 
     def _hear(self, topic: str) -> None:
         """Subscribe the way that hears whoever publishes, whatever the QoS."""
         def on_message(message: Float64, info: dict[str, Any]) -> None:
-            if topic == topics.PLANT_OUTPUT:
-                self._newest_at = time.monotonic()
-                if self._answers and not self._rivals:
-                    self._answer(message.data)
-            self._note(topic, driver_check.Message(
+            if topic == topics.PLANT_OUTPUT and self._drive is not None:
+                self._drive.answer(message.data)
+            self._messages.note(topic, driver_check.Message(
                 message.data, info['source_timestamp'], info['received_timestamp'],
                 info['publication_sequence_number']))
 
         self.listen(Float64, topic, on_message, profile(self, topic))
 
-    def _note(self, topic: str, message: driver_check.Message) -> None:
-        self._heard.by_topic[topic].append(message)
-        print(topic, message.stamp_ns, repr(message.value), sep=',', file=self._file)
-
-    def _answer(self, y: float) -> None:
-        """Move v on by a sample, unless the motion has ended."""
-        low, high = self._options.output_range or (-inf, inf)
-        if plausible(y) and not low <= y <= high:
-            self._ended = self._ended or f'y = {y:.4g} left --output-range'
-        if self._ended:
-            return
-        if self._motion is None:
-            self._motion = self._begin(self._v_at_start())
-        v, now = self._motion.step(), time.time_ns()
-        self._control.publish(Float64(data=v))
-        self._note(topics.CONTROL, driver_check.Message(v, now, now, 0))
-
-    def _v_at_start(self) -> float:
-        """The v that acts before the motion, 0 where nobody says it."""
-        initial = self.settings.control.initial
-        known = initial if plausible(initial) else None
-        for message in self._heard.applied[-1:]:
-            if plausible(message.value):
-                return build_limits(self.settings).go_on_from(message.value, known)
-        if known is None:
-            self._say('nobody says which v acts now, so the drive goes on from 0: publish '
-                      f'{topics.APPLIED_CONTROL}, or set control.initial')
-        return known or 0.0
-
-    def _come_to_rest(self) -> None:
-        if self._motion is None:
-            return
-        before, deadline = len(self.signals), time.monotonic() + self._options.rest
-        v = self._heard.controls[-1].value
-        for v in self._motion.to_rest():
-            self._control.publish(Float64(data=v))
-            time.sleep(self.settings.sample_period)
-            late = time.monotonic() > deadline
-            if late or len(self.signals) > before:
-                why = f'not at rest within --rest={self._options.rest:g} s' if late \
-                    else 'another signal came'
-                self._say(f'v is held at {v:.6g}: {why}')
-                break
-        # A busy machine may lose a message, and this one is to be heard before the node leaves.
-        for _ in range(10):
-            self._control.publish(Float64(data=v))
-            if self._control.wait_for_all_acked(Duration(seconds=0.1)):
-                return
-        self._say(f'the driver has not confirmed the last v={v:.6g}')
-
     def _tell(self) -> int:
         """Say what came of it; returns the exit code."""
-        options, heard = self._options, self._heard
-        if self._rivals:
-            self._say(f'{self._control_topic} is published by {self._rivals}: stop that first, '
-                      'or leave --drive out')
+        drive, options = self._drive, self._options
+        control = self.resolve_topic_name(topics.CONTROL)
+        if drive is not None and drive.rivals:
+            say(self, f'{control} is published by {drive.rivals}: stop that first, '
+                'or leave --drive out')
             return BAD_INPUT
+        ended = '' if drive is None else drive.ended
         if options.messages:
-            if self._ended:
-                self._say(f'{self._ended}: drive ended')
-            if self._motion is None:
-                why = f'nobody subscribes to {self._control_topic}' if heard.outputs \
-                    else f'nothing was heard on {self._output_topic}'
-                self._say(f'the actuator was not moved: {why}')
-            return FAILED if self._motion is None else DONE
-        findings = driver_check.judge(self._graph, heard, self.settings)
-        if self._ended:
+            if ended:
+                say(self, f'{ended}: drive ended')
+            if drive is not None and drive.moved:
+                return DONE
+            why = f'nobody subscribes to {control}' if self._messages.heard.outputs else \
+                f'nothing was heard on {self.resolve_topic_name(topics.PLANT_OUTPUT)}'
+            say(self, f'the actuator was not moved: {why}')
+            return FAILED
+        findings = driver_check.judge(self._graph, self._messages.heard, self.settings)
+        if ended:
             findings.append(driver_check.Judgement(
-                'drive', driver_check.WRONG, f'{self._ended}: drive ended',
+                'drive', driver_check.WRONG, f'{ended}: drive ended',
                 'let y come all the time; widen --output-range, or drive less: --amplitude, --rate',
             ))
         print(driver_check.table(findings), flush=True)
@@ -220,19 +260,20 @@ class CheckDriverNode(ProcessNode):
 
     def _save(self, path: Path) -> None:
         period = self.settings.sample_period
-        record = driver_check.timing_of(self._heard, period).record
+        record = driver_check.timing_of(self._messages.heard, period).record
         if record is None:
-            self._say(f'nothing to save in {path}: v and y were not both heard')
+            say(self, f'nothing to save in {path}: v and y were not both heard')
             return
         rows = np.column_stack([period * np.arange(len(record[0])), *record])
         try:
             np.savetxt(path, rows, '%.12g', ',', header='t,v,y', comments='')
             print(f'saved {len(rows)} samples of v and y in {path}')
         except OSError as error:
-            self._say(f'{path}: cannot be written: {error.strerror}')
+            say(self, f'{path}: cannot be written: {error.strerror}')
 
-    def _say(self, text: str) -> None:
-        print(f'{self.get_name()}: {text}', file=sys.stderr)
+
+def say(node: Node, text: str) -> None:
+    print(f'{node.get_name()}: {text}', file=sys.stderr)
 
 
 def publishers(node: Node, topic: str) -> list[TopicEndpointInfo]:
