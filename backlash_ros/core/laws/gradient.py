@@ -17,6 +17,7 @@ Reference: G. Tao, P. V. Kokotović, Adaptive Control of Systems with Actuator a
 Nonlinearities, Wiley 1996.
 """
 
+from dataclasses import dataclass
 from math import nan
 
 import numpy as np
@@ -26,6 +27,31 @@ from backlash_ros.core.law import Interval, Law
 from backlash_ros.core.laws.input_reconstruction import LEAST_SQUARE, MEMORY, Agreement
 from backlash_ros.core.plant.numerics import FourBlocks
 from backlash_ros.core.plant.transfer_function import Array
+
+
+class Filters:
+    """W of phi and of u_d, and what returns of y, side by side in observer form."""
+
+    def __init__(self, blocks: FourBlocks) -> None:
+        models = [*[blocks.disturbance.state_space()] * 4, blocks.returned.state_space()]
+        self.a, self.b = models[0][0], np.column_stack([b for _, b, _ in models])
+        self.x: Array = np.zeros(self.b.shape)
+
+    def step(self, inputs: Array) -> list[float]:
+        """Outputs (5,) after phi, u_d and y (5,)."""
+        self.x = self.a @ self.x + self.b * inputs
+        outputs: list[float] = self.x[0].tolist()
+        return outputs
+
+
+@dataclass
+class Means:
+    """Running means of v^2, u_d^2 and zeta' P zeta, by which the adaptation is normalised."""
+
+    v_square: float = 0.0
+    u_square: float = 0.0
+    size: float = 0.0  # of zeta' P zeta
+    samples: int = 0  # so far; MEMORY of them count
 
 
 class GradientEstimator(Law):
@@ -42,42 +68,35 @@ class GradientEstimator(Law):
     ) -> None:
         self.estimate, self.step = initial, step
         self._bounds, self._noise_square = bounds, (10.0 * noise_std) ** 2
-        self._agreement = Agreement()
-        # W of phi and of u_d, and what returns of y, side by side in observer form.
-        filters = [*[blocks.disturbance.state_space()] * 4, blocks.returned.state_space()]
-        self._a, self._b = filters[0][0], np.column_stack([b for _, b, _ in filters])
-        self._x: Array = np.zeros(self._b.shape)
+        self._agreement, self._filters, self._means = Agreement(), Filters(blocks), Means()
         self._y = 0.0  # the newest one, or what was expected of it
         self._phi: Array = np.zeros(3)
-        self._v_square = self._u_square = self._size = 0.0  # means, the last of zeta' P zeta
-        self._samples = 0
 
     def update(self, y: float | None, interval: Interval) -> None:
-        old = self.estimate
+        old, means = self.estimate, self._means
         self._phi = self._engaged(interval, old)
         theta = np.array([old.m, old.m * old.c_r, old.m * old.c_l])
         self.u_hat = float(theta @ self._phi)
         inputs = np.concatenate((self._phi, (interval.u_d, self._y)))
-        self._x = self._a @ self._x + self._b * inputs
-        *of_phi, demanded, returned = self._x[0].tolist()
+        *of_phi, demanded, returned = self._filters.step(inputs)
         zeta = np.array(of_phi)
-        self._samples += 1
-        share = 1.0 / min(self._samples, MEMORY)
-        self._v_square += share * (interval.v**2 - self._v_square)
-        self._u_square += share * (interval.u_d**2 - self._u_square)
+        means.samples += 1
+        share = 1.0 / min(means.samples, MEMORY)
+        means.v_square += share * (interval.v**2 - means.v_square)
+        means.u_square += share * (interval.u_d**2 - means.u_square)
         expected = float(theta @ zeta) - returned
         if y is None:
             self.innovation, self._y = nan, expected
             return
         self._y, self.innovation = y, y - expected
-        if min(self._v_square, self._u_square) < LEAST_SQUARE:
+        if min(means.v_square, means.u_square) < LEAST_SQUARE:
             return
         xi = float(theta @ zeta - demanded)
-        scaled = zeta * np.array([1.0 / self._v_square, 1.0, 1.0])
+        scaled = zeta * np.array([1.0 / means.v_square, 1.0, 1.0])
         size = float(zeta @ scaled)
-        self._size += share * (size - self._size)
-        least = max(0.1 * self._size, self._noise_square / self._u_square)
-        norm = size + least + xi**2 / self._u_square
+        means.size += share * (size - means.size)
+        least = max(0.1 * means.size, self._noise_square / means.u_square)
+        norm = size + least + xi**2 / means.u_square
         if norm == 0.0 or not self.adapting:
             return
         new = old

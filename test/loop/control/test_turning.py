@@ -105,7 +105,7 @@ def test_feedback_is_as_hard_as_its_noise_beside_the_gap_allows(noise: float) ->
     run, structure = loop.run(len(asked)), loop.controller.structure
     assert isinstance(structure, Tracking)
     assert 0.0 < structure.feedback.noise_u <= 0.1 * 1.3 * 6.0
-    hardest = structure.feedback.noise_u == structure.feedback.u_std[0]
+    hardest = structure.feedback.noise_u == structure.feedback.noise.u_std[0]
     assert hardest is (noise == 0.0)
     assert noise == 0.0 or turns(run.column('v'), 3.0) < 80
 
@@ -130,7 +130,7 @@ def test_no_noise_of_y_hides_a_turn_beside_which_the_gap_is_small() -> None:
         trajectory.take(0.1 * k)
         trajectory.turn(1e6, 1.0, 0.0, 0.0)
         trajectory.prepare()
-    assert trajectory.side is Region.RIGHT
+    assert trajectory.turning.side is Region.RIGHT
 
 
 def test_noise_of_the_references_asks_for_a_trajectory_that_it_moves_less() -> None:

@@ -74,11 +74,21 @@ class FeedbackState:
     blind_for: int = 1  # samples from now on in which x_hat cannot be known
 
 
+@dataclass
+class DeviationNoise:
+    """How much of x_hat - x* may be noise: of y, of x_hat, and of the references that make x*."""
+
+    u_std: list[float]  # of K (x_hat - x*) for each gain, at least K times half the noise of y
+    x_std: float = 0.0  # of |x_hat|
+    x_known: bool = False  # whether the covariance of x_hat is
+    ignored: float = 0.0  # |x_hat - x*| that is left alone
+    tolerated: float = 0.0  # |x_hat - x*| that is worth no crossing
+
+
 class StateFeedback:
     """Gains of a design, used as far as the estimate is trusted; shrinkage: see Tracking.
 
     While nothing is known the acquisition gain replaces K, and the trajectory excites the backlash.
-    u_std: of K (x_hat - x*) for each gain, at least K times half the noise of y. x_std: of |x_hat|.
     """
 
     def __init__(self, design: TrackingDesign, shrinkage: float, noise_std: float) -> None:
@@ -92,10 +102,7 @@ class StateFeedback:
         """Use these gains."""
         self._design = design
         self._least = 0.5 * self.y_std * np.array([hypot(*gain) for gain in design.schedule])
-        self.u_std: list[float] = self._least.tolist()
-        # |x_hat - x*| that may be noise, so that it is left alone, or worth no crossing.
-        self.x_std = self._ignored = self._tolerated = 0.0
-        self._knows_x = False  # whether the covariance of x_hat is known
+        self.noise = DeviationNoise(self._least.tolist())
         # Places in the schedule: of the gain that its noise asks for, and of the one in use.
         self._quiet = self._in_use = 0
 
@@ -138,21 +145,22 @@ class StateFeedback:
         self, x_cov: Array | None, y_std: float, x_noise: Array, reference_std: float,
     ) -> None:
         """Choose the gain that noise allows; x_noise: covariance of x* for noise of 1 in r."""
-        deviation_std, self._knows_x = 0.0, x_cov is not None
+        noise, deviation_std = self.noise, 0.0
+        noise.x_known = x_cov is not None
         if x_cov is not None:
             of_x_hat = self._design.variances(x_cov)
             of_both = of_x_hat + reference_std**2 * self._design.variances(x_noise)
             stds = np.sqrt(np.maximum(of_both, 0.0))
-            self.x_std = max(of_x_hat.item(-1), 0.0)**0.5
-            self.u_std, deviation_std = np.maximum(stds[:-1], self._least).tolist(), stds.item(-1)
+            noise.x_std = max(of_x_hat.item(-1), 0.0)**0.5
+            noise.u_std, deviation_std = np.maximum(stds[:-1], self._least).tolist(), stds.item(-1)
         # By as much v may rest off: one rule for motion and rest.
-        self._ignored = ARRIVED * max(CLOSE * y_std, UNCERTAIN * self.x_std)
+        noise.ignored = ARRIVED * max(CLOSE * y_std, UNCERTAIN * noise.x_std)
         # What noise of the references moves and v did not follow shows as a deviation as well.
-        self._tolerated = max(self._ignored, ARRIVED * UNCERTAIN * deviation_std)
+        noise.tolerated = max(noise.ignored, ARRIVED * UNCERTAIN * deviation_std)
         # As hard as leaves what feedback makes of noise below a tenth of the u that the gap takes.
         most = 0.1 * self.gap_u or inf
-        self._quiet = next((i for i, std in enumerate(self.u_std) if std <= most),
-                           len(self.u_std) - 1)
+        self._quiet = next((i for i, std in enumerate(noise.u_std) if std <= most),
+                           len(noise.u_std) - 1)
 
     def deviation(self, x_hat: Sequence[float] | Array, x: Sequence[float]) -> list[float]:
         """x_hat - x*; 0 while x_hat cannot be known."""
@@ -169,7 +177,7 @@ class StateFeedback:
         # Per sample, of the bound while the backlash is unknown; samples without a limit after
         # which feedback takes a step back to full.
         widening, stiffen_after = 1.03, 20
-        state, trust, most = self.state, self.trust, self.bounds[0]
+        state, trust, most, noise = self.state, self.trust, self.bounds[0], self.noise
         if trust.held_for:
             off = hypot(*error)
             if held_back or state.bounded:
@@ -180,13 +188,13 @@ class StateFeedback:
                     state.level -= 1
             # K, or the less of it the longer v does not follow, and the newer the estimate. Far
             # away, beyond what x* has been and noise explains, it does not matter what noise does.
-            astray = off > max(largest, ASTRAY / ARRIVED * self._ignored)
+            astray = off > max(largest, ASTRAY / ARRIVED * noise.ignored)
             unproven = SOFTEST - trust.held_for * (SOFTEST + 1) // TRUSTED_AFTER
             self._in_use = max(state.level, unproven, 0 if astray else self._quiet)
             feedback = worth = dot(self._design.schedule[self._in_use], error)
             if self.knows_noise:
-                feedback *= 1.0 - self._ignored / max(off, self._ignored)
-                worth *= 1.0 - self._tolerated / max(off, self._tolerated)
+                feedback *= 1.0 - noise.ignored / max(off, noise.ignored)
+                worth *= 1.0 - noise.tolerated / max(off, noise.tolerated)
         else:
             feedback = worth = dot(self._design.acquisition or (), error)
             if not -most < feedback < most:
@@ -223,12 +231,12 @@ class StateFeedback:
     @property
     def knows_noise(self) -> bool:
         """Whether full feedback can tell a deviation from noise."""
-        return self.trust.full and self._knows_x
+        return self.trust.full and self.noise.x_known
 
     @property
     def noise_u(self) -> float:
         """Standard deviation of what feedback makes of noise."""
-        return self.u_std[self._quiet]
+        return self.noise.u_std[self._quiet]
 
     @property
     def bounds(self) -> tuple[float, float]:

@@ -67,7 +67,7 @@ class Tracking(ControlStructure):
             return False
         fastest, ahead = trust.slope * max(self._moves), plan.ahead[:foreseen + 1]
         rounding = 1e-9 * max(map(abs, ahead))
-        return all(-rounding <= (after - before) * plan.side <= fastest + rounding
+        return all(-rounding <= (after - before) * plan.turning.side <= fastest + rounding
                    for before, after in pairwise(ahead))
 
     # --- taking over ----------------------------------------------------------------------------
@@ -145,7 +145,7 @@ class Tracking(ControlStructure):
         u_d += added
         pull, before = feedback.pull_back(deviation), rest.mode
         mode = rest.decide(y, self._noise_std, plan, deviation,
-                           None if x_cov is None else feedback.x_std, inverse.side, pull,
+                           None if x_cov is None else feedback.noise.x_std, inverse.side, pull,
                            abs(correction) > noise)
         if mode.steps and mode is not before:
             rest.target = inverse.extreme, 0.0  # stay where v is
@@ -189,14 +189,14 @@ class Tracking(ControlStructure):
         # comes back across it, and has to be more than noise. What is not must not go further than
         # feedback agrees with either, but for what hands v over.
         plan, side, (c_r, c_l) = self.trajectory, inverse.side, self.feedback.trust.crossings
-        if side is Region.GAP or side is not plan.side or c_r == c_l:
+        if side is Region.GAP or side is not plan.turning.side or c_r == c_l:
             return worth
         held = inverse.held_u * side
-        least, most = min(worth * side, held), max(plan.furthest * side, held)
+        least, most = min(worth * side, held), max(plan.turning.furthest * side, held)
         if worth * side > most + noise:
             most = worth * side
         elif abs(self.hand_over.added) <= noise and wanted * side > max(plan.aim * side, held):
-            furthest = self.feedback.furthest(deviation, plan.ahead, side, plan.turns_in)
+            furthest = self.feedback.furthest(deviation, plan.ahead, side, plan.turning.turns_in)
             most = max(min(most, furthest * side), plan.aim * side, held)
         return min(max(wanted * side, least), most) * side
 
@@ -207,7 +207,7 @@ class Tracking(ControlStructure):
         other side as well, where y is pushed, by more than the noise in u_d.
         """
         plan, side, (c_r, c_l) = self.trajectory, inverse.side, self.feedback.trust.crossings
-        asked = plan.side
+        asked = plan.turning.side
         if c_r == c_l and asked is not Region.GAP and u_d != inverse.held_u:
             return Region.RIGHT if u_d > inverse.held_u else Region.LEFT  # nothing is crossed
         if asked is Region.GAP or side is Region.GAP:

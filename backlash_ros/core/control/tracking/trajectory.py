@@ -6,6 +6,7 @@ A turn of u* is seen before it comes. That decides on which side v is: once per 
 feedback is.
 """
 
+from dataclasses import dataclass
 from math import ceil, dist, isnan, nan
 
 import numpy as np
@@ -29,8 +30,6 @@ class ReferenceWindow:
     def __init__(self, preview: int, history: int, noise_gains: Array) -> None:
         self.noise_gains = noise_gains
         self._preview, self._kept = preview, history + preview + 1
-        self._fits, self._first, self._widths = parabolas(preview)
-        self._half = max(self._widths, default=0)
         # As they came, as they are used, and what u* makes of noise of 1 in them. Written from the
         # left to the right; when they are full their end moves to the front.
         self._rows: Array = np.zeros((3, 2 * self._kept))
@@ -73,7 +72,7 @@ class ReferenceWindow:
 
     def settle(self) -> None:
         """Make of the newest reference what only the next sample needs."""
-        newest, half = self._end - 1, self._half
+        newest, half = self._end - 1, max(parabolas(self._preview)[2], default=0)
         self._rows[0, newest] = self._rows[1, newest]
         self._rows[2, newest] = self.noise_gains[0]
         self.noise.take(self._rows.item(0, newest))
@@ -95,8 +94,8 @@ class ReferenceWindow:
         # Mean square of what is left beside a parabola, in those of the noise, up to which the
         # references are taken for one, and from which on not: at a step, or a sharp turn.
         one, none = 1.8, 3.0
-        widths, first = self._widths, self._first
-        rest = self._fits @ self._rows[0, at - self._half:at + self._half + 1]
+        fits, first, widths = parabolas(self._preview)
+        rest = fits @ self._rows[0, at - widths[-1]:at + widths[-1] + 1]
         of_noise = rest / self.noise.std  # its square may be too small for a number
         squares = np.add.reduceat(of_noise * of_noise, first).tolist()
         reference = value = self._rows.item(0, at)
@@ -109,21 +108,28 @@ class ReferenceWindow:
         self._rows[1, at], self._rows[2, at] = value, gain
 
 
+@dataclass
+class Turning:
+    """On which side u* moves, and where it turns."""
+
+    side: Region = Region.GAP  # on which u* moves
+    decided: int = 0  # samples for which it stays
+    extreme: float = nan  # furthest u* on it
+    furthest: float = nan  # u* to which u goes without turning
+    turns_in: int = 0  # samples until u* turns, or all that are known ahead
+
+
 class IdealTrajectory:
     """Follows the references, a sample at a time: `take`, `turn`, `prepare` for the next one.
 
-    x, q: x* (n,) and q*. ahead: u* from this sample on, shape (L,). side: on which u* moves, and
-    extreme, the furthest u* on it. turns_in: samples until u* turns, or all that are known ahead.
-    furthest: u* to which u goes without turning. moved: by how much x* did. spread: of the
-    references, beyond their noise.
+    x, q: x* (n,) and q*. ahead: u* from this sample on, shape (L,). moved: by how much x* did.
+    spread: of the references, beyond their noise.
     """
 
     def __init__(self, design: TrackingDesign) -> None:
         self.x, self.q, self.ahead = [0.0] * design.model.order, 0.0, [0.0]
         self.moved = self.spread = 0.0
-        self.side, self.extreme, self.furthest, self.turns_in = Region.GAP, nan, nan, 0
-        self._decided = 0  # samples for which the side stays
-        plan = design.plans[0]
+        self.turning, plan = Turning(), design.plans[0]
         self.references = ReferenceWindow(
             len(plan.references[0]) - 1, design.model.memory, plan.noise_gains)
         self.use(design)
@@ -135,13 +141,13 @@ class IdealTrajectory:
     @property
     def aim(self) -> float:
         """u* of this sample, or what it comes back to without having turned."""
-        passes = self.side is not Region.GAP and (self.u - self.furthest) * self.side > 0.0
-        return self.furthest if passes else self.u
+        side, furthest = self.turning.side, self.turning.furthest
+        return furthest if side is not Region.GAP and (self.u - furthest) * side > 0.0 else self.u
 
     @property
     def back(self) -> float:
         """By how much u* has come back without having turned."""
-        return max((self.extreme - self.u) * self.side, 0.0)
+        return max((self.turning.extreme - self.u) * self.turning.side, 0.0)
 
     @property
     def noise_band(self) -> float:
@@ -153,7 +159,6 @@ class IdealTrajectory:
         """Be this one of the trajectories of a design from the next sample on."""
         self.design, self.softness, self._plan = design, softness, design.plans[softness]
         self.references.noise_gains = self._plan.noise_gains
-        self._newest_gains: list[float] = self._plan.references[:, -1].tolist()
         self._due: list[float] | None = None  # u* ahead at the next sample, but for its reference
         self._transition: list[tuple[list[float], float]] = list(
             zip(design.model.a.tolist(), design.model.b.tolist(), strict=True))
@@ -201,11 +206,11 @@ class IdealTrajectory:
 
     def take(self, y_m: float) -> None:
         """Take in r(k + N), so that u* is known for this sample and those ahead."""
-        references, r = self.references, float(y_m)
+        references, r, gains = self.references, float(y_m), self._plan.references[:, -1].tolist()
         due = self._due or self._ahead(references.window[1:])
         references.append(r)
         self.spread = max(references.high, r) - min(references.low, r) - references.noise_spread
-        self.ahead = [u + gain * r for u, gain in zip(due, self._newest_gains, strict=True)]
+        self.ahead = [u + gain * r for u, gain in zip(due, gains, strict=True)]
 
     def turn(self, noise_std: float, gap_u: float, band: float, crossing: float) -> bool:
         """Decide on which side v is to be at this sample; returns whether it is another one.
@@ -213,37 +218,38 @@ class IdealTrajectory:
         noise_std: of y. gap_u: u that the gap takes. band: of u*, see `_turn`. crossing: samples
         that v takes across the gap; it leaves as much before the turn as it arrives after it.
         """
-        ahead, before, taken, turns_in = self.ahead, self.side, ceil(crossing), 0
-        if isnan(self.extreme):
-            self.extreme = ahead[0]
+        ahead, turning, before = self.ahead, self.turning, self.turning.side
+        taken, turns_in = ceil(crossing), 0
+        if isnan(turning.extreme):
+            turning.extreme = ahead[0]
         arrival = max(taken - 1, 0)
         # What moves y by less than its noise is no turn, unless it is a hundredth of the gap.
         least = min(noise_std / self.design.push_ahead, 0.01 * gap_u)
         noise = max(least, self.noise_band)
-        if self._decided > 0:
-            self._decided -= 1
+        if turning.decided > 0:
+            turning.decided -= 1
         elif before is Region.GAP:
-            moves = [u - self.extreme for u in ahead]
+            moves = [u - turning.extreme for u in ahead]
             if max(map(abs, moves[:arrival + 1])) > least:
                 first = next((move for move in moves if abs(move) > noise), 0.0)
-                self.side = Region((first > 0.0) - (first < 0.0))
+                turning.side = Region((first > 0.0) - (first < 0.0))
         else:
-            peak = _turn(ahead, self.extreme, before, noise, band, taken)
+            peak = _turn(ahead, turning.extreme, before, noise, band, taken)
             turns_in = len(ahead) if peak is None else max(peak, 0)
             later = ahead[min(arrival, len(ahead) - 1)]
-            if peak is not None and peak < taken and (later - self.extreme) * before <= 0.0:
-                self.side = Region(-before)
-                self.extreme, self._decided = later, arrival
-        if (ahead[0] - self.extreme) * self.side > 0.0 and not self._decided:
-            self.extreme = ahead[0]
-        self.turns_in = turns_in if self.side is before else 0
-        most, least_of = (max, min) if self.side is Region.RIGHT else (min, max)
-        self.furthest = most(ahead)
-        if self.turns_in == len(ahead) \
-                and least_of(ahead[ahead.index(self.furthest):]) != ahead[-1]:
+            if peak is not None and peak < taken and (later - turning.extreme) * before <= 0.0:
+                turning.side = Region(-before)
+                turning.extreme, turning.decided = later, arrival
+        if (ahead[0] - turning.extreme) * turning.side > 0.0 and not turning.decided:
+            turning.extreme = ahead[0]
+        turning.turns_in = turns_in if turning.side is before else 0
+        most, least_of = (max, min) if turning.side is Region.RIGHT else (min, max)
+        turning.furthest = most(ahead)
+        if turning.turns_in == len(ahead) \
+                and least_of(ahead[ahead.index(turning.furthest):]) != ahead[-1]:
             # A swing that is no turn, and over: it is not followed there and back.
-            self.furthest = ahead[-1]
-        return self.side is not before
+            turning.furthest = ahead[-1]
+        return turning.side is not before
 
     @property
     def noise(self) -> tuple[Array, float]:
