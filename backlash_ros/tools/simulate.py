@@ -7,7 +7,7 @@ from functools import partial
 from math import inf
 
 from backlash_ros.core.estimate import Status
-from backlash_ros.core.loop.diagnosis import LoopFigures, Neighbours, state_beside
+from backlash_ros.core.loop.diagnosis import Learning, LoopFigures, Neighbours, state_beside
 from backlash_ros.core.loop.sample_counter import Timing
 from backlash_ros.core.parameters import Parameters, as_yaml
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
@@ -57,7 +57,7 @@ def _once(parameters: Parameters, options: argparse.Namespace) -> None:
     if law.estimate.status != Status.TRACKING:
         state = state_beside(set(), LoopFigures(
             timing=Timing(parameters.sample_period), around=Neighbours(),
-            status=law.estimate.status, law=law.report))
+            learning=Learning(law.estimate.status, law.report)))
         print(f'at the end: {state.text}')
     print(f'report: {directory / REPORT_PAGE}')
 

@@ -72,8 +72,8 @@ class ControlLoop:
     ) -> None:
         self.counter, self.heard, self.phase = counter, Newest(), Phase.BEGINS
         # Within six deviations of its noise y stands still.
-        self.statistics = LoopStatistics(still_band=6.0 * p.estimator.output_noise_std)
-        self.commands = CommandHistory(p.sample_period, report_use(p), self.statistics)
+        counts = LoopStatistics(still_band=6.0 * p.estimator.output_noise_std)
+        self.commands = CommandHistory(p.sample_period, report_use(p), counts)
         self.executor = executor or Executor()
         self.core = build_controller(p, estimate, self.executor)
         self.knows_v = v is not None
@@ -82,6 +82,10 @@ class ControlLoop:
         self.driver, self._p, self._send = driver, p, send
         self._gap = NEXT_SAMPLE  # what is missing since the newest output that was used
         self._ending: Iterator[float] = iter(())  # commands that lead v to its end
+
+    @property
+    def statistics(self) -> LoopStatistics:
+        return self.commands.counts
 
     @property
     def counted(self) -> dict[str, int]:

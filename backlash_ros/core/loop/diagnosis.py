@@ -1,7 +1,7 @@
 """Why the loop is not well: one table of conditions over what was counted, and their log."""
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import IntEnum
 from math import inf, isfinite, nan
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
@@ -128,24 +128,31 @@ class Neighbours(NamedTuple):
     rivals: tuple[str, ...] = ()
 
 
+class Learning(NamedTuple):
+    """How the learning goes. given: the estimates are taken as the parameters give them.
+
+    status: None before the first command. inconsistent_s: for how long it has been INCONSISTENT.
+    """
+
+    status: Status | None = None
+    law: LawReport = LawReport()
+    inconsistent_s: float = 0.0
+    adapting: bool = True
+    given: bool = False
+
+
 @dataclass(kw_only=True)
 class LoopFigures(Counts):
     """What the controller knows of the last few seconds; the counts are those gained in them.
 
-    status: None before the first command. inconsistent_s: for how long it has been INCONSISTENT.
-    given: the estimates are taken as the parameters give them. silent_s: timeout that has passed
-    without y, 0 if it has not; reference_silent_s: likewise, inf before the first y_m. still:
-    newest values of y in a row that are equal within its noise. v_swing: how far v has moved
-    meanwhile, and gap, nan while it is not learned [unit of v].
+    silent_s: timeout that has passed without y, 0 if it has not; reference_silent_s: likewise, inf
+    before the first y_m. still: newest values of y in a row that are equal within its noise.
+    v_swing: how far v has moved meanwhile, and gap, nan while it is not learned [unit of v].
     """
 
     timing: Timing
     around: Neighbours
-    status: Status | None = None
-    law: LawReport = field(default_factory=LawReport)
-    inconsistent_s: float = 0.0
-    adapting: bool = True
-    given: bool = False
+    learning: Learning
     standing_down: bool = False
     silent_s: float = 0.0
     on_timeout: str = 'hold'
@@ -167,9 +174,9 @@ def figures_of_loop(loop: 'ControlLoop', p: Parameters, timing: Timing,
         **cast(Mapping[str, Any], gained), around=around,
         # In lockstep the outputs come as fast as the machine goes.
         timing=Timing(p.sample_period) if p.lockstep else timing,
-        status=estimate.status if statistics.used else None, law=law.report,
-        inconsistent_s=statistics.inconsistent * p.sample_period, adapting=law.adapting,
-        given=was_given(estimate),
+        learning=Learning(
+            estimate.status if statistics.used else None, law.report,
+            statistics.inconsistent * p.sample_period, law.adapting, was_given(estimate)),
         standing_down=loop.standing_down, on_timeout=p.on_timeout,
         silent_s=p.timeout.plant_output if loop.silent else 0.0,
         reference_silent_s=p.timeout.reference * unreferred if isfinite(loop.heard.y_m) else inf,
@@ -188,7 +195,7 @@ def findings_of(f: LoopFigures) -> list[Finding]:
     that is held for a while because samples are late or lost is a warning about these.
     """
     causes = _findings(causes_of(f))
-    state, law = state_beside({cause.kind for cause in causes}, f), f.law
+    state, law = state_beside({cause.kind for cause in causes}, f), f.learning.law
     if state.kind == 'model':
         # What the fit has found out itself says more than what is late or missing; a wrong sign
         # drives v into its limits besides, and comes of no clock.
@@ -245,7 +252,7 @@ def causes_of(f: LoopFigures) -> tuple[Row, ...]:
     """The table of causes, the likeliest first."""
     _, warn, error = Level
     y, y_m, v, rivals = f.around
-    timing, status = f.timing, f.status
+    timing, status = f.timing, f.learning.status
     rate, age_s, period_s = timing.rate, timing.age_s, timing.nominal_s
     heard, due = f.heard, f.heard + f.lost
     begins = status is None and f.silent_s == 0.0
@@ -320,23 +327,23 @@ def causes_of(f: LoopFigures) -> tuple[Row, ...]:
 def _states_beside(causes: set[str], f: LoopFigures) -> tuple[Row, ...]:
     """The table of states where causes of these kinds were found: the first that holds counts."""
     ok, warn, error = Level
-    y, status, law = f.around.output, f.status, f.law
+    y, (status, law, inconsistent_s, adapting, given) = f.around.output, f.learning
     share = 100.0 * law.unexplained
     name, value, (low, high) = law.forbidden or OutOfBounds('', nan, (nan, nan))
     # Neither rate nor lateness turns a sign.
     held = status == Status.INCONSISTENT and not law.wrong_sign
     # Where a tenth is late or lost nobody can tell what else is wrong; nor for some seconds else.
     many = f.late + f.lost > 0.1 * (f.heard + f.lost)
-    late = not causes.isdisjoint(LATE_KINDS) and (many or f.inconsistent_s < 3.0)
+    late = not causes.isdisjoint(LATE_KINDS) and (many or inconsistent_s < 3.0)
     return (
         ('held', warn, held and ('rate' in causes or late), f'{y} does not follow from v '
          + ('at this rate' if 'rate' in causes else 'while samples are late or lost')
          + ': estimates held'),
         # What is not there yet is among the causes; else all is about to begin.
         ('begins', ok, status is None, 'the loop begins'),
-        ('given', ok, f.given and status == Status.TRACKING,
+        ('given', ok, given and status == Status.TRACKING,
          'estimates as given: estimator.law fixed learns nothing'),
-        ('adaptation off', ok, not f.adapting and status != Status.INCONSISTENT,
+        ('adaptation off', ok, not adapting and status != Status.INCONSISTENT,
          'estimates held as ~/freeze_adaptation asked; v is still answered'),
         ('known', ok, law.unconfirmed and status == Status.ACQUIRING,
          'estimates of before hold: only a v at several speeds could confirm them'),

@@ -9,7 +9,23 @@ import numpy as np
 
 
 @dataclass
-class Counts:
+class MessageCounts:
+    """Messages that were not as they should be."""
+
+    without_reference: int = 0  # outputs before the first y_m
+    bad_outputs: int = 0  # values of y that are no finite number
+    bad_references: int = 0  # ... and of y_m
+    bad_reports: int = 0  # ... and of applied_control
+    extra: int = 0  # outputs that were repeated, too early, old or of a second driver
+
+    @property
+    def dropped(self) -> int:
+        """Messages that held no finite number."""
+        return self.bad_outputs + self.bad_references + self.bad_reports
+
+
+@dataclass
+class Counts(MessageCounts):
     """Samples and messages, since a loop began or lately."""
 
     used: int = 0  # outputs that brought a command
@@ -21,16 +37,6 @@ class Counts:
     limited: int = 0  # commands that met a limit
     wraps: int = 0  # times that y jumped by 2 pi
     dead_workers: int = 0  # processes for fits that died
-    without_reference: int = 0  # outputs before the first y_m
-    bad_outputs: int = 0  # values of y that are no finite number
-    bad_references: int = 0  # ... and of y_m
-    bad_reports: int = 0  # ... and of applied_control
-    extra: int = 0  # outputs that were repeated, too early, old or of a second driver
-
-    @property
-    def dropped(self) -> int:
-        """Messages that held no finite number."""
-        return self.bad_outputs + self.bad_references + self.bad_reports
 
     @property
     def heard(self) -> int:

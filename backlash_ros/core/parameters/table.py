@@ -225,10 +225,9 @@ class TruePlant(NamedTuple):
         'input_disturbance it is no part of the u that plant/truth shows', 'u', low=0.0)
 
 
-class ParameterTree:
-    """All parameters: `tree.control.max` is the value of control.max."""
+class NodeParameters:
+    """What nodes are given beside the numbers of control."""
 
-    # what nodes are given beside the numbers of control
     sample_period: float = option(
         0.01, 'sample period T of G(z)', 's', low=0.0, above=True,
         used_by=(CONTROLLER, PLANT, REFERENCE_NODE), per_node=True)
@@ -256,7 +255,11 @@ class ParameterTree:
         (), 'joints of an arm, each a loop of its own in one controller, in the order of their '
         'commands in an array; empty for one loop')
     io: DriverMessages
-    # model, estimator and control
+
+
+class ControllerParameters:
+    """Model, estimator and control."""
+
     plant: PlantModel
     estimator: EstimatorOptions
     estimates: SavedEstimates
@@ -271,7 +274,11 @@ class ParameterTree:
     inverse: InverseOptions
     fixed: FixedDoubt
     control: ControlLimits
-    # the plant that is simulated
+
+
+class SimulatedPlantParameters:
+    """The plant that is simulated."""
+
     backlash: SimulatedBacklash
     output_noise_std: float = simulated(0.0, 'simulated noise on y', 'y', low=0.0, change='live')
     output_quantum: float = simulated(
@@ -282,7 +289,11 @@ class ParameterTree:
     truth: TruePlant
     seed: int = simulated(1, 'seed of the simulated noise', low=0)
     samples: int = simulated(0, 'outputs to simulate, 0 for no end', low=0)
-    # the reference y_m
+
+
+class ReferenceParameters:
+    """The reference y_m."""
+
     waveform: str = of_reference(
         'sine', 'shape of y_m',
         choices=('sine', 'step', 'square', 'triangle', 'multisine', 'chirp', 'file'), change='live')
@@ -295,7 +306,11 @@ class ParameterTree:
         10.0, 'duration of a chirp', 's', low=0.0, above=True, change='live')
     bias: float = of_reference(0.0, 'constant added to y_m', 'y_m', change='live')
     file: str = of_reference('', 'CSV of rows t,y_m for waveform: file', change='live')
-    # a run: its bag, its axes, its driver
+
+
+class RunParameters:
+    """A run: its bag, its axes, its driver."""
+
     storage: str = option(
         'mcap', 'format of the bag', choices=('mcap', 'sqlite3'), used_by=(RECORDER,))
     bag: str = option(
@@ -310,6 +325,13 @@ class ParameterTree:
         '', 'command to start instead of plant, where {axis} stands for the name of the axis; '
         'none waits for a driver that is started elsewhere, empty is the simulated plant',
         used_by=(BRINGUP,))
+
+
+class ParameterTree(
+    RunParameters, ReferenceParameters, SimulatedPlantParameters, ControllerParameters,
+    NodeParameters,
+):
+    """All parameters: `tree.control.max` is the value of control.max."""
 
 
 BY_NAME: dict[str, Parameter] = {each.name: each for each in declared_in(ParameterTree)}

@@ -13,6 +13,7 @@ from backlash_ros.core.loop.diagnosis import (
     LONGEST_TEXT,
     UNNAMED,
     Finding,
+    Learning,
     Level,
     LoopFigures,
     Neighbours,
@@ -30,12 +31,12 @@ WELL = LoopFigures(
         TopicFigures('plant_output', peers=(DRIVER,)),
         TopicFigures('reference', peers=(Peer('/reference', 'Float64'),)),
         TopicFigures('control', peers=(DRIVER,)),
-    ), status=Status.TRACKING, used=600,
+    ), learning=Learning(Status.TRACKING), used=600,
 )
 
 
 def replace(figures: LoopFigures, **changes: Any) -> LoopFigures:
-    for part in ('timing', 'around'):
+    for part in ('timing', 'around', 'learning'):
         present = getattr(figures, part)
         own = {name: changes.pop(name) for name in present._fields if name in changes}
         changes[part] = present._replace(**own)
