@@ -7,6 +7,7 @@ for its result; neither waits for a job.
 import os
 import pickle
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -14,7 +15,6 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from importlib import import_module
-from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Event, Thread
@@ -29,6 +29,31 @@ class Failure(NamedTuple):
     """What comes of a job without a result: the class of its exception, LOST of a dead worker."""
 
     kind: str
+
+
+class Link:
+    """Messages of bytes over a socket, each behind its length (multiprocessing takes 2 MB)."""
+
+    def __init__(self, end: socket.socket) -> None:
+        self._end, self._stream = end, end.makefile('rwb')
+
+    def send_bytes(self, body: bytes) -> None:
+        self._stream.write(len(body).to_bytes(8, 'little'))
+        self._stream.write(body)
+        self._stream.flush()
+
+    def recv_bytes(self) -> bytes:
+        """The next message; raises EOFError where the other end is gone."""
+        size = int.from_bytes(self._stream.read(8), 'little')
+        body = self._stream.read(size)
+        if not size or len(body) < size:
+            raise EOFError
+        return body
+
+    def close(self) -> None:
+        with suppress(OSError):  # of what could not be sent any more
+            self._stream.close()
+        self._end.close()
 
 
 class Channel:
@@ -155,11 +180,11 @@ class Worker(NamedTuple):
     """A worker process, and where jobs go and results come from."""
 
     process: subprocess.Popen[bytes]
-    link: Connection
+    link: Link
 
 
 def _start(preload: tuple[str, ...], loops: int) -> Worker:
-    link, other_end = Pipe()
+    own_end, other_end = socket.socketpair()
     handle = other_end.fileno()
     code = f'import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve; ' \
         f'serve({handle}, {preload!r}, {loops})'
@@ -178,7 +203,7 @@ def _start(preload: tuple[str, ...], loops: int) -> Worker:
     os.setpriority(os.PRIO_PROCESS, process.pid, niceness)
     with suppress(OSError):  # a kernel that does not share the processors between sessions
         Path(f'/proc/{process.pid}/autogroup').write_text(str(niceness))
-    return Worker(process, link)
+    return Worker(process, Link(own_end))
 
 
 # --- in the worker ------------------------------------------------------------------------------
@@ -188,7 +213,7 @@ def serve(handle: int, preload: Sequence[str], loops: int) -> None:
     """Compute jobs that come through an inherited connection, until it ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)
-    link, requests = Connection(handle), SimpleQueue[bytes]()
+    link, requests = Link(socket.socket(fileno=handle)), SimpleQueue[bytes]()
     Thread(target=_receive, args=(link, requests), daemon=True).start()
     for name in preload:
         import_module(name)
@@ -206,7 +231,7 @@ def serve(handle: int, preload: Sequence[str], loops: int) -> None:
         time.sleep(max(-credit_s / share, 0.0))
 
 
-def _receive(link: Connection, requests: SimpleQueue[bytes]) -> None:
+def _receive(link: Link, requests: SimpleQueue[bytes]) -> None:
     """Read requests, also while a job is computed, and end the process with the connection."""
     with suppress(EOFError, OSError):
         while True:
