@@ -21,6 +21,11 @@ class Window(NamedTuple):
     def end(self) -> int:
         return self.first + len(self.v)
 
+    @property
+    def is_open(self) -> bool:
+        """Whether another command may have acted anywhere."""
+        return bool(np.isfinite(self.other).any())
+
     def between(self, first: int, end: int | None = None) -> 'Window':
         """The samples from one number to before another."""
         begin = max(first - self.first, 0)

@@ -175,7 +175,11 @@ class Redesign:
         if proposal is not None and proposal is not self.considered and not self.channel.busy:
             self.considered, self._gains, self._waited = proposal, None, 0
             model = proposal if serial is None else serial.before(proposal)
-            self.channel.submit(_designed, structure.redesign(model))
+            job = structure.redesign(model)
+            if job is None:
+                self._gains = ()  # the better G alone takes over
+            else:
+                self.channel.submit(_designed, job)
         found = self.channel.poll()
         if isinstance(found, Failure):
             if found.kind == LOST:

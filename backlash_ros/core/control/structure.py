@@ -62,9 +62,9 @@ class ControlStructure:
     def prepare(self) -> None:
         """Do what the next command need not wait for; the next one does it where nobody asks."""
 
-    def redesign(self, model: StateModel) -> Callable[[], object | None]:
-        """What makes gains for a better G in any process; None where they are no safe ones."""
-        return tuple  # there are none to make
+    def redesign(self, model: StateModel) -> Callable[[], object | None] | None:
+        """What makes gains for a better G in any process, or None if unsafe; None: none to make."""
+        return None
 
     def adopt(self, gains: object, source: StateSource) -> None:
         """Use such gains from the next sample on, without a jump of v; source: of their x_hat."""

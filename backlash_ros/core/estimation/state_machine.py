@@ -37,7 +37,7 @@ def learn(setup: Setup, record: Window, before: Belief) -> Belief:
     kept, record = before.kept, record.without(before.kept.rejected)
     try:
         with np.errstate(all='ignore'):
-            if before.fit is not None:  # late commands alone contradict nothing
+            if before.fit is not None and record.is_open:  # late commands contradict nothing
                 p, since = setup.problem(record, kept.older), before.end - setup.family.memory
                 record, swapped = likelier(p, before.fit, record, since, kept.swapped)
                 before = before._replace(kept=kept._replace(swapped=swapped))
@@ -100,7 +100,7 @@ def _with_commands(
     setup: Setup, record: Window, found: WindowFit | None, swapped: frozenset[int],
 ) -> tuple[Window, WindowFit | None, frozenset[int]]:
     """The record, the fit and the commands that go with each other, found in turn."""
-    if found is None or not np.isfinite(record.other).any():
+    if found is None or not record.is_open:
         return record, found, swapped
     sent = record, found, swapped
     for _ in range(4):

@@ -204,9 +204,9 @@ def _described(s: StructureSearch, given: Identification, options: Options) -> I
     observed, total = search.observed_of(s.samples, best), float(g.numerator.sum())
     static = total if structure.integrator else total / float(g.denominator.sum())
     # Where no structure explains all, likelihoods say little: those that do about as well count.
+    alike = search.predictors(s.compared) if observed.unexplained else []
     apart = max(s.apart, models.by_model(best.gap, [
-        (one.whole.gap, 1.0) for one in search.predictors(s.compared)
-        if observed.unexplained and one.whole.rms < search.ALIKE * best.rms]))
+        (one.whole.gap, 1.0) for one in alike if one.whole.rms < search.ALIKE * best.rms]))
     verdict = judge(Findings(
         observed, sqrt(gap_var), units.v_size * apart, sqrt(c_r_var),
         float(np.copysign(np.abs(g.at(middle))[0], static)), gain_std, float(spread.max()),
