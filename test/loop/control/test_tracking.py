@@ -10,7 +10,9 @@ from strategies import known_backlash
 from backlash_ros.core.assembly import build_controller, build_model, build_plant, build_reference
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.tracking.design import (
+    CONFIDENCES,
     PreviewGains,
+    _observer,
     design,
     modulus_margin,
     preview_gains,
@@ -188,6 +190,24 @@ def test_with_the_true_slope_the_observer_changes_no_pole_of_the_loop(gain: list
     assume(abs(radius - 1.0) > 1e-3)
     gains = PreviewGains(k, 0.0, np.zeros(1))
     assert (modulus_margin(model, model, gains) > 0.0) == (radius < 1.0)
+
+
+@pytest.mark.parametrize('weight', [0.0, 1e-3, 1.0])
+def test_the_modulus_margin_is_that_of_the_loop_with_its_integral(weight: float) -> None:
+    model = StateModel(TransferFunction([0.1, 0.05], [1.0, -1.7, 0.72]))
+    gains, most = preview_gains(model, 0.1, weight), 0.0
+    for confidence in CONFIDENCES:
+        a, drive, seen, correction = _observer(model, confidence)
+        x, x_hat, q, pushed = np.zeros(2), np.zeros(3), 0.0, []
+        for k in range(3000):
+            u = -gains.state @ x_hat[:2] - gains.integral * q
+            pushed.append(u + (k == 0))  # a unit pulse added to u: what becomes of it is 1/(1 + L)
+            q -= model.c * x[0]
+            x = model.a @ x + model.b * pushed[-1]
+            x_hat = a @ x_hat + drive * u
+            x_hat += correction * (model.c * x[0] - seen @ x_hat)
+        most = max(most, np.abs(np.fft.rfft(pushed, 2**15)).max())
+    assert modulus_margin(model, model, gains) == pytest.approx(1.0 / most, rel=2e-3)
 
 
 @pytest.mark.parametrize('law', ['moving_horizon', 'fixed'])

@@ -143,6 +143,12 @@ def test_noise_of_the_references_asks_for_a_trajectory_that_it_moves_less() -> N
     assert not trajectory.soften(0.0), 'without a gap noise costs no crossing'
     assert trajectory.soften(1.0)
     assert trajectory.references.noise_gains[-1] < 0.5 * before
+    assert not trajectory.soften(1.0)
+    for _ in range(310):  # as many references as tell what the noise is
+        trajectory.take(0.0)
+        trajectory.prepare()
+    assert trajectory.soften(1.0), 'noise that is gone asks for nothing any more'
+    assert trajectory.references.noise_gains[-1] == before
 
 
 def test_a_deviation_that_noise_explains_is_left_alone() -> None:

@@ -7,7 +7,7 @@ feedback is.
 """
 
 from dataclasses import dataclass
-from math import ceil, dist, isnan, nan
+from math import ceil, dist, inf, isnan, nan
 
 import numpy as np
 
@@ -164,17 +164,23 @@ class IdealTrajectory:
             zip(design.model.a.tolist(), design.model.b.tolist(), strict=True))
 
     def soften(self, gap_u: float) -> bool:
-        """Ask for less where noise of references makes u* cross a gap of this u; say if so."""
+        """Weigh u as noise of the references demands for a gap of this u; say if that is new."""
         # What each plan makes of noise that is averaged over the widest parabola.
         of_noise = [plan.noise_gains.item(-1) for plan in self.design.plans]
-        now, noise_std = of_noise[self.softness], self.references.noise.std
-        if gap_u == 0.0 or noise_std * now <= QUIET * gap_u:
+        now, noise_std = self.softness, self.references.noise.std
+        most = QUIET * gap_u / noise_std if noise_std > 0.0 else inf
+        if gap_u == 0.0:
             return False
-        softer = next((i for i, gain in enumerate(of_noise) if noise_std * gain <= QUIET * gap_u),
-                      of_noise.index(min(of_noise)))
-        if of_noise[softer] > 0.5 * now:
-            return False  # nothing is won: what moves u* is the reference itself
-        self.use(self.design, softer)
+        # Another one has to win a factor of two: how large the noise is, is known no better. What
+        # softer ones leave is the reference itself.
+        hardest = next((i for i, gain in enumerate(of_noise[:now]) if 2.0 * gain <= most), now)
+        if of_noise[now] > most:
+            softer = next((i for i, gain in enumerate(of_noise) if gain <= most),
+                          of_noise.index(min(of_noise)))
+            hardest = softer if 2.0 * of_noise[softer] <= of_noise[now] else now
+        if hardest == now:
+            return False
+        self.use(self.design, hardest)
         return True
 
     def replay(self) -> None:
