@@ -65,6 +65,7 @@ def record_of(
     known_v, known_y = np.isfinite(table[1:3])
     if (known_v & known_y).sum() < 0.05 * min(known_v.sum(), known_y.sum()):
         said.append('v and y stand in rows of their own')
+        table[1, known_v] = _with_turns_counted('v', table[1, known_v], notes)
         sent = table[:2, known_v]
         table[1, 0] = sent[1, 0]
         table[1] = _held(table[1])
@@ -94,9 +95,7 @@ def without_turns(
         notes.append(f'y reads exactly {value:.6g} in {bad.sum()} of {len(bad)} rows, far from the '
                      'rows around: taken for reads that failed')
         y = np.where(bad, np.nan, y)
-    (y, turn_of_y), (v, turn_of_v) = readings.unwrapped(y), readings.unwrapped(v)
-    notes += [f'{name} jumps by {turn:.6g} where it begins anew: the turns are counted'
-              for name, turn in (('y', turn_of_y), ('v', turn_of_v)) if turn]
+    y, v = _with_turns_counted('y', y, notes), _with_turns_counted('v', v, notes)
     y, turn = readings.without_slips(y, v)
     if turn:
         notes.append(f'y jumps by {turn:.6g}, a whole turn, while v does not: taken out')
@@ -104,6 +103,13 @@ def without_turns(
     if sensor_period:
         said.append(f'y repeats {len(y) / own.sum():.2g} times: {1.0 / sensor_period:.3g} Hz')
     return v, np.where(own, y, np.nan)
+
+
+def _with_turns_counted(name: str, values: Array, notes: list[str]) -> Array:
+    values, turn = readings.unwrapped(values)
+    if turn:
+        notes.append(f'{name} jumps by {turn:.6g} where it begins anew: the turns are counted')
+    return values
 
 
 def usable(record: Record, read: Array, said: list[str], notes: list[str]) -> Record:

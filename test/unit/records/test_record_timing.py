@@ -311,6 +311,14 @@ def test_an_angle_that_begins_anew_is_unwrapped(turn: float, step: float) -> Non
     assert found - found[0] == pytest.approx(angle - angle[0], abs=1e-9 * turn)
     record: Record = record_of(T, MOTION, np.mod(angle, turn))
     assert any('begins anew' in note for note in record.notes)
+    # Where v and y come in rows of their own, v is what those of v say.
+    nothing, shift = np.full(len(T), np.nan), 0.25 * (T[1] - T[0])
+    apart: Record = record_of(
+        np.column_stack([T, T + shift]).ravel(),
+        np.column_stack([nothing, np.mod(angle, turn)]).ravel(),
+        np.column_stack([MOTION, nothing]).ravel())
+    assert np.abs(np.diff(apart.v)).max() < 0.5 * turn
+    assert [note.split()[0] for note in apart.notes if 'begins anew' in note] == ['v']
 
 
 @pytest.mark.parametrize('values', [
