@@ -77,20 +77,17 @@ class AdaptiveController:
                 f'y={y!r}, y_m={y_m!r}, applied={applied!r} and commands={commands!r} must be '
                 f'finite and no larger than {LARGEST_SIGNAL:g}')
         serial, inverse = self._serial, self.inverse
-        if self._interval is not None:
+        if (before := self._interval) is not None:
             self.lost_samples += lost
             for i in range(lost + 1):
-                heard, interval = y if i == lost else None, self._interval
-                if commands:
-                    interval = interval._replace(v=commands[i])
+                heard, other = y if i == lost else None, nan
+                command = commands[i] if commands else before.v
                 v = applied[i] if applied else None
                 if serial is not None:
-                    v = serial.update(heard, interval.v, v, self.estimator.estimate)
-                elif alternatives and not applied:
-                    interval = interval._replace(other=alternatives[i])
-                if v is not None:
-                    interval = interval._replace(v=v)
-                self.estimator.update(heard, interval)
+                    v = serial.update(heard, command, v, self.estimator.estimate)
+                elif v is None:
+                    v, other = command, alternatives[i] if alternatives else nan
+                self.estimator.update(heard, Interval(v, before.y_m, before.u_d, other))
         used = estimate = self.estimator.estimate
         if not self.compensating:
             used = replace(estimate, c_r=0.0, c_l=0.0)

@@ -102,7 +102,7 @@ class GradientEstimator(Law):
         new = old
         if old.status is not Status.INCONSISTENT:
             theta = theta + (self.step * self.innovation / norm) * scaled
-            new = Estimate(*self._bounds.of_products(*theta.tolist()), old.f)
+            new = Estimate(*self._bounds.of_products(*theta.tolist()), old.f, status=old.status)
         self.estimate = self._agreement.judged(new, (*zeta.tolist(), y + returned))
 
     def _engaged(self, interval: Interval, used: Estimate) -> Array:

@@ -70,10 +70,11 @@ class InputReconstruction:
                 'give the standard deviation of the noise on y, in the unit of y',
             )
         # While no sample is lost, prediction and correction are one map.
-        closed = self._step - np.outer(gain, self._c * self._step[0])
-        self._steady = closed, gain, self._covariance
-        self.std = sqrt(variance)
-        self._z: Array = np.zeros(n + 1 + lag)  # given y(..k)
+        by_z = np.append(-self._c * self._step[0], 1.0)  # innovation, from z and y
+        self._steady = np.vstack([np.outer(gain, by_z), by_z])
+        self._steady[:-1, :-1] += self._step
+        self._steady_covariance, self.std = self._covariance, sqrt(variance)
+        self._z: Array = np.zeros(n + 2 + lag)  # given y(..k), and its innovation
         self._since_loss = 4 * lag
 
     def _stationary(self, size: int) -> Array:
@@ -93,21 +94,21 @@ class InputReconstruction:
 
     @property
     def u_hat(self) -> float:
-        return float(self._z[-1])
+        return self._z.item(-2)
 
     def newer(self, samples: int) -> float:
         """u_hat(k - lag + samples) given y(..k)."""
-        return float(self._z[-1 - samples])
+        return self._z.item(-2 - samples)
 
     @property
     def ready(self) -> bool:
         """Whether the start is forgotten and u_hat about as good as without lost samples."""
-        return self.samples > 2 * self.lag and bool(self._covariance[-1, -1] <= 4.0 * self.std**2)
+        return self.samples > 2 * self.lag and self._covariance.item(-1) <= 4.0 * self.std**2
 
     @property
     def x_hat(self) -> Array:
         """State of G given y(..k) in the coordinates of StateModel, shape (n,)."""
-        return np.asarray(self._z[:-1 - self.lag] * self._scale)
+        return np.asarray(self._z[:-2 - self.lag] * self._scale)
 
     def update(self, y: float | None) -> float:
         """Take in y(k), None if it was lost, and return u_hat(k - lag)."""
@@ -115,17 +116,19 @@ class InputReconstruction:
         self._since_loss = 0 if y is None else self._since_loss + 1
         # Samples after a lost one until the covariance is stationary again.
         if y is not None and self._since_loss > 4 * self.lag:
-            scaled, (closed, gain, self._covariance) = y / self._scale, self._steady
-            self.innovation = (scaled - float((self._c * self._step[0]) @ self._z)) * self._scale
-            self._z = closed @ self._z + gain * scaled
+            self._covariance = self._steady_covariance
+            self._z[-1] = y / self._scale
+            self._z = self._steady @ self._z
+            self.innovation = self._z.item(-1) * self._scale
             return self.u_hat
         self._covariance = self._propagated(self._covariance)
-        self._z, self.innovation = self._step @ self._z, nan
+        z, self.innovation = self._step @ self._z[:-1], nan
         if y is not None:
-            e = y / self._scale - self._c * float(self._z[0])
+            e = y / self._scale - self._c * z.item(0)
             self.innovation = e * self._scale
             gain, self._covariance = self._corrected(self._covariance)
-            self._z += gain * e
+            z += gain * e
+        self._z = np.append(z, nan)
         return self.u_hat
 
     def _corrected(self, p: Array) -> tuple[Array, Array]:
@@ -170,7 +173,7 @@ class Agreement:
             moved = zip(theta, self._judged, self._weights, strict=True)
             if sum((weight * (now - then)) ** 2 for now, then, weight in moved) > self._most:
                 self.status = Status.ACQUIRING
-        return replace(new, status=self.status)
+        return new if new.status is self.status else replace(new, status=self.status)
 
     def _judge(self, theta: tuple[float, float, float]) -> Status:
         size = np.sqrt(np.diag(self._products)[:3])

@@ -119,7 +119,8 @@ class NormalisedLms(LaggedLaw):
         if self.step_f > 0.0:
             f += self.step_f * (u - past.u_d) * v / (1.0 + v * v)
             f = min(max(f, self._f_bounds[0]), self._f_bounds[1])
-        return Estimate(*self._bounds.of_products(m + gain * weight * v, product_r, product_l), f)
+        m, c_r, c_l = self._bounds.of_products(m + gain * weight * v, product_r, product_l)
+        return Estimate(m, c_r, c_l, f, status=old.status)
 
 
 def printed_f(u: float, y_m: float, m: float, w: float) -> float:
