@@ -203,10 +203,9 @@ def _described(s: StructureSearch, given: Identification, options: Options) -> I
     delays = tuple(sorted({*search.equal_delays(s.compared, s.chosen), structure.delay}))
     observed, total = search.observed_of(s.samples, best), float(g.numerator.sum())
     static = total if structure.integrator else total / float(g.denominator.sum())
-    # Where no structure explains all, likelihoods say little: those that do about as well count.
-    alike = search.predictors(s.compared) if observed.unexplained else []
+    # Where no structure explains all, likelihoods say little: all that predict as well count.
     apart = max(s.apart, models.by_model(best.gap, [
-        (one.whole.gap, 1.0) for one in alike if one.whole.rms < search.ALIKE * best.rms]))
+        (one.whole.gap, 1.0) for one in search.predictors(s.compared) if observed.unexplained]))
     verdict = judge(Findings(
         observed, sqrt(gap_var), units.v_size * apart, sqrt(c_r_var),
         float(np.copysign(np.abs(g.at(middle))[0], static)), gain_std, float(spread.max()),

@@ -161,6 +161,12 @@ class Observed:
         widths = (6e-4, 3e-3, 0.01, 0.03, 0.1, 0.2, 0.4, 0.6, 0.8, self.gap / self.family.swing)
         return self.family.best(centred, [(width,) for width in widths])
 
+    @cached_property
+    def plays(self) -> Candidate:
+        """The best many plays in parallel."""
+        return self.family.best(_many, [
+            (widest, share) for widest in (0.1, 0.3, 0.7) for share in (0.0, 0.4)])
+
 
 # --- nonlinearities of v (N,), scaled to 0 to 1, and what is said of them -------------------------
 
@@ -324,7 +330,7 @@ NONLINEARITIES: tuple[tuple[
      lambda _: [(width,) for width in (0.003, 0.01, 0.03, 0.1, 0.2, 0.4)],
      'y leads v by {:.3g} where v turns: the drive compensates a backlash already, by too much',
      'switch that off, or leave it to it'),
-    (_many, lambda _: [(widest, share) for widest in (0.1, 0.3, 0.7) for share in (0.0, 0.4)],
+    (_many, lambda _: (),
      'many plays in parallel explain it, up to {:.3g} wide: y turns smoothly, as with friction '
      'along the way or in a piezo', 'only a single backlash is compensated here'),
     (_sticking, lambda width: [(wider * width, share * width) for wider, share in (
@@ -350,7 +356,8 @@ def best_other(o: Observed) -> Answer | None:
     """The best of the nonlinearities that explain y far better than a play does."""
     f, named = o.family, []
     for nonlinearity, starts, said, cure in NONLINEARITIES:
-        best = f.best(nonlinearity, starts(abs(o.one_play.at[0])))
+        best = o.plays if nonlinearity is _many else f.best(
+            nonlinearity, starts(abs(o.one_play.at[0])))
         if f.beats(best, o.one_play, o.noise):
             at = f.swing * np.array(best.at)
             named.append((best.squares, said.format(*np.abs(at), places=f.low + at), cure))

@@ -39,7 +39,6 @@ EARLY, LONGEST_DELAY = (0, 1, 2, 3), 40  # delays that are compared first, and t
 GENERAL_POLES = 3  # of the G with which the gap is searched first; it has a tap for each delay
 HELD_OUT = 1.0 / 3.0  # share of the record, its last
 PLATEAU = 10.0  # difference of the criterion below which two delays are equally good
-ALIKE = 1.1  # ratio of residuals up to which structures explain about as much
 EXACT = 1e-10  # rms over that of y, less than which no error counts: simulations round
 
 
@@ -301,8 +300,8 @@ def later(early: StructureSearch, options: Options, progress: Progress) -> Struc
             best.structure.unknowns - late.best.structure.unknowns)
         # Very strong evidence (Kass and Raftery, J. Am. Stat. Assoc. 90 (1995) 773-795).
         if better <= 5.0:
-            return early._replace(apart=max(early.apart, by_model(
-                best.gap, [(late.best.gap, -2.0 * better)])))
+            return early._replace(delays=[*early.delays, *late.delays], apart=max(
+                early.apart, by_model(best.gap, [(late.best.gap, -2.0 * better)])))
         early = late
     return early
 

@@ -139,6 +139,11 @@ def _doubts(f: Findings) -> Iterator[Doubt]:
         behind = rows * log(squares / o.rms**2) + unknowns * log(max(rows, 1.0))
         yield Doubt(by_model(f.gap, [(gap, behind)]),
                     f'with another linear G it would be {gap:.3g}', SEVERAL)
+        # Widths that are spread evenly have a deviation of their own.
+        widest = abs(o.plays.at[0]) * o.family.swing
+        share = min(o.family.share(o.plays, o.one_play, o.noise), 1.0)
+        yield Doubt(share * widest / 12.0**0.5, f'many plays in parallel, up to {widest:.3g} '
+                    'wide, explain y better', 'only a single backlash is compensated here')
 
 
 def _coasts(f: Findings) -> Iterator[Doubt]:
@@ -171,8 +176,10 @@ def _changes(f: Findings) -> Iterator[Doubt]:
         hats = np.array([np.interp(over, at, row) for row in np.eye(knots)])
         gaps, other = family.changing(f.gap, hats)
         if np.ptp(gaps) > 0.1 * f.gap and family.share(other, one, o.noise) >= half:
-            yield Doubt(float(np.sqrt(np.mean((gaps @ hats - f.gap) ** 2))),
-                        f'the gap changes {what}: ' + ', '.join(f'{gap:.3g}' for gap in gaps), cure)
+            along = gaps @ hats
+            yield Doubt(float(np.sqrt(np.mean((along - f.gap) ** 2))),
+                        f'the gap changes {what}, {along.mean():.3g} in the mean: '
+                        + ', '.join(f'{gap:.3g}' for gap in gaps), cure)
 
 
 def _backlash(f: Findings, most: Doubt, spread: float, coasts: bool) -> Answer:

@@ -135,6 +135,16 @@ def test_a_gap_that_changes_is_told_with_its_values_and_widens_the_deviation() -
     assert 'changes within the record' in unsure.backlash.reason
 
 
+def test_a_smooth_hysteresis_is_no_known_gap_though_a_play_fits_roughly() -> None:
+    wind, band = [0.0], 0.3 * GAP  # as of friction by P. R. Dahl
+    for step in np.diff(V):
+        wind.append(wind[-1] + step - abs(step) * wind[-1] / band)
+    y = behind(V - 0.5 * np.array(wind), 'lag')
+    found = judge(FOUND._replace(observed=observed(V, y, 0.169)))  # as wide as the best play
+    assert not found.backlash.known
+    assert 'many plays in parallel' in found.backlash.reason
+
+
 @pytest.mark.parametrize(('changed', 'said'), [
     ({'gain': -0.8}, 'the gain of G is negative'),
     ({'open_delay': 3}, 'try --delay 3-10'),
