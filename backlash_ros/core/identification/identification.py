@@ -203,9 +203,11 @@ def _described(s: StructureSearch, given: Identification, options: Options) -> I
     delays = tuple(sorted({*search.equal_delays(s.compared, s.chosen), structure.delay}))
     observed, total = search.observed_of(s.samples, best), float(g.numerator.sum())
     static = total if structure.integrator else total / float(g.denominator.sum())
-    # Where no structure explains all, likelihoods say little: all that predict as well count.
-    apart = max(s.apart, models.by_model(best.gap, [
-        (one.whole.gap, 1.0) for one in search.predictors(s.compared) if observed.unexplained]))
+    # Where no structure explains all, likelihoods say little: as likely are all that predict as
+    # well. A normal deviation is 1.48 times the median distance, which no single one spoils.
+    alike = search.predictors(s.compared) if observed.unexplained else []
+    apart = max(s.apart, 1.4826 * float(np.median(
+        [abs(one.whole.gap - best.gap) for one in alike] or [0.0])))
     verdict = judge(Findings(
         observed, sqrt(gap_var), units.v_size * apart, sqrt(c_r_var),
         float(np.copysign(np.abs(g.at(middle))[0], static)), gain_std, float(spread.max()),
