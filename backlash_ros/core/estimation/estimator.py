@@ -49,14 +49,12 @@ def fitted(
 
     model: whose state the structure wants. proposed: xi of the newest G (K,), () if to be left.
     """
-    swapped = before.kept.swapped
-    record = samples.swapped(swapped)
-    first = max(before.kept.first, record.end - settings.LONGEST)
-    belief = learn(setup, record.between(first), before)
+    record = samples.swapped(before.kept.swapped)
+    belief = learn(setup, record.between(record.end - settings.LONGEST), before)
     fit, kept = belief.fit, belief.kept
     if fit is None or belief.published is None:
         return Fitted(belief)
-    part = record.swapped(kept.swapped ^ swapped).between(kept.first, belief.end)
+    part = record.swapped(kept.swapped ^ before.kept.swapped).between(kept.first, belief.end)
     run = setup.problem(part, kept.older).at(fit)
     newest = slice(-min(len(part.v), 4 * setup.family.memory, settings.ROWS), None)
     u, y = run.u[newest], part.y[newest]

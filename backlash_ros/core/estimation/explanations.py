@@ -97,7 +97,7 @@ def afresh(
     xi = np.zeros(family.count) if like is None else like.theta[3:]
     # Where v has not turned often enough for any gap, what is found is named, but not used.
     hopeless = record.turns(0.01 * swing, first) < setup.turns_needed
-    candidates, apart = 1 if hopeless else 3, 0.1  # gaps that are fitted, and their distance
+    candidates, least = 1 if hopeless else 3, 0.1  # gaps that are fitted, and their distance
     fits: list[WindowFit] = []
     # Once more around G as the best of the first gaps has it.
     for _ in range(2 if family.count and like is None and not hopeless else 1):
@@ -107,7 +107,7 @@ def afresh(
         gaps: list[float] = []
         for _, gap, p0, m in found:
             if len(gaps) < candidates and m * found[0].m > 0.0 and \
-                    all(abs(gap - other) > apart * other for other in gaps):
+                    all(abs(gap - other) > least * other for other in gaps):
                 gaps.append(gap)
                 theta = np.concatenate([[m, m * (p0 - first), gap], xi])
                 begin = WindowFit(np.zeros(1), p0, theta, noise, walk_std=setup.walk_std)
@@ -143,13 +143,14 @@ def mixed(p: Problem, best: WindowFit, others: Sequence[WindowFit] = ()) -> Wind
         return mixed(p, likeliest, fits)
     share = np.exp([f.evidence - best.evidence for f in fits])
     for each, f in zip(share / max(float(share.sum()), 1e-300), fits, strict=True):
-        wider += each * _apart(f, best)
+        wider += each * apart(f, best)
     return replace(best, spread=wider)
 
 
-def _apart(one: WindowFit, other: WindowFit) -> Array:
-    apart = one.crossings - other.crossings
-    return np.asarray(np.outer(apart, apart))
+def apart(one: WindowFit, other: WindowFit) -> Array:
+    """What m, c_r, c_l of one spread around those of the other (3, 3)."""
+    by = one.crossings - other.crossings
+    return np.asarray(np.outer(by, by))
 
 
 def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]:
@@ -175,7 +176,7 @@ def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]
                     there = p.step(there, held=True)
                 behind = max(likeliest - p.log_posterior(there, weights), 1.0)
                 if nearer <= 2.0:  # the furthest that is likely may lie well before this one
-                    more = max(0.5 / behind - reach**-2, 0.0) * _apart(there, best)
+                    more = max(0.5 / behind - reach**-2, 0.0) * apart(there, best)
                     wider = max(wider, more, key=np.trace)
                 if not there.m > 0.0:
                     break

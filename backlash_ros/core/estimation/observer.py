@@ -157,8 +157,7 @@ class Following:
         self.since_motion = self.outliers = self.beyond = 0
         self._p = nan  # v until a backlash is known
         # Over the newest samples. Numbers: the collector would have to visit so many pairs.
-        self._u: deque[float] = deque(maxlen=ROWS)
-        self._y: deque[float] = deque(maxlen=ROWS)
+        self._u, self._y = deque[float](maxlen=ROWS), deque[float](maxlen=ROWS)
 
     @property
     def surprised(self) -> bool:

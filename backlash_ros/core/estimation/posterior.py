@@ -81,8 +81,7 @@ def mean_information(half: float) -> float:
 def independence(
     y: Array, known: NDArray[np.bool_], output: Array, step: float,
 ) -> tuple[Array, NDArray[np.intp]]:
-    """Share (N,) of an independent reading that each one is, and where these begin among the known.
-    """
+    """Share (N,) of an independent reading that each is, and where these begin among the known."""
     # Equal readings, one after the other, repeat one rounding while the output stands still.
     same_place = 16  # parts of a step within which an output counts as standing still
     weights = known.astype(np.float64)

@@ -35,7 +35,6 @@ def search(
     v, y: (N,), y nan where lost. widest: gap that is considered. xi: error of G (K,), around which
     G is linearized. smallest: gap that is compared, over the swing of v.
     """
-    none = 1e-9  # gap that counts as none, over the swing of v
     known, begins, (b, a) = np.isfinite(y), _bins(v), family.at(xi.tolist())
     readings = np.add.reduceat(known.astype(np.float64), begins)
     weights = (readings > 0.0) / np.sqrt(np.maximum(readings, 1.0))
@@ -94,8 +93,8 @@ def search(
 
     swing = float(np.ptp(v))
     top = min(swing, widest)
-    gaps: Array = np.append(none * swing, np.geomspace(smallest * min(swing, top), top, 32))
-    # Of so many at once that memory holds them.
+    gaps: Array = np.append(1e-9 * swing, np.geomspace(smallest * min(swing, top), top, 32))
+    # The first is none at all. Of so many at once that memory holds them.
     parts = np.array_split(gaps, 1 + len(gaps) * len(v) * (1 + family.count) // 500_000)
     found = [h for part in parts for h in compared(part) if isfinite(h.evidence)]
     e = [-inf, *(h.evidence for h in found), -inf]

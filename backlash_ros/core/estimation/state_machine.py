@@ -21,7 +21,7 @@ from backlash_ros.core.estimation import settings
 from backlash_ros.core.estimation.belief import Belief, Known, State, Trial, shortened
 from backlash_ros.core.estimation.explanations import Setup, afresh, mixed, outliers
 from backlash_ros.core.estimation.fit import FEW_STEPS, Problem
-from backlash_ros.core.estimation.late_commands import likelier
+from backlash_ros.core.estimation.late_commands import likelier, weighed
 from backlash_ros.core.estimation.posterior import Prior, WindowFit, agree
 from backlash_ros.core.estimation.settings import BLOCKS, FEWEST, MISFIT, PREDICTED, SHORT_RECORD
 from backlash_ros.core.estimation.unmodelled import coasts, with_walk
@@ -40,7 +40,9 @@ def learn(setup: Setup, record: Window, before: Belief) -> Belief:
             if before.fit is not None and record.is_open:  # late commands contradict nothing
                 p, since = setup.problem(record, kept.older), before.end - setup.family.memory
                 record, swapped = likelier(p, before.fit, record, since, kept.swapped)
-                before = before._replace(kept=kept._replace(swapped=swapped))
+                now = record.end if swapped != kept.swapped else before.thorough[0]
+                before = before._replace(kept=kept._replace(swapped=swapped),
+                                         thorough=(now, before.thorough[1]))
             return look[before.state](setup, record, before)
     except np.linalg.LinAlgError:
         first = max(record.end - settings.FIRST_FIT, record.first)
@@ -56,7 +58,6 @@ def _begun_anew(before: Belief, first: int, end: int, next_at: int) -> Belief:
 
 
 def _searching(setup: Setup, record: Window, before: Belief) -> Belief:
-    shortest = 50  # samples of a part of a record that is searched alone
     count, tried = len(record.v), before.found
     soon = record.end + max(count // BLOCKS, FEWEST)
     known_once = tried is not None and setup.is_known(tried)
@@ -69,8 +70,8 @@ def _searching(setup: Setup, record: Window, before: Belief) -> Belief:
     fit, shorter = afresh(setup, record, also=tried, walks=True), record
     why = _why(setup, fit, record, before)
     part, found, swapped = _with_commands(setup, record, fit, before.kept.swapped)
-    while why in (Status.INCONSISTENT, Status.NOT_EXCITED) and len(shorter.v) >= 3 * shortest:
-        # What happened at its beginning may have spoilt a record.
+    while why in (Status.INCONSISTENT, Status.NOT_EXCITED) and len(shorter.v) >= 150:
+        # What happened at its beginning may have spoilt a record; 50 samples are the shortest part.
         shorter = shorter.between(shorter.end - len(shorter.v) // 3)
         newest = _with_commands(setup, shorter, afresh(setup, shorter), before.kept.swapped)
         if newest[1] is not None and setup.is_known(newest[1]):
@@ -110,7 +111,8 @@ def _with_commands(
             break
         found = afresh(setup, record, also=found) or found
     # Commands that leave more than noise explain nothing: those that were sent stay.
-    return sent if found.systematic and setup.noisier(found) else (record, found, swapped)
+    noisier = found.systematic and setup.noisier(found)
+    return sent if noisier else weighed(setup, record, found, swapped)
 
 
 def _why(setup: Setup, found: WindowFit | None, record: Window, before: Belief) -> Status:
@@ -167,24 +169,28 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
         # What contradicts one explanation after the other is no backlash.
         must = min(2 * trial.must, settings.MOST_PREDICTED) if lately else PREDICTED
         return before._replace(
-            end=record.end, found=None, kept=kept, trial=trial._replace(must=must),
+            end=record.end, found=None, trial=trial._replace(must=must),
             doubt_from=record.first + new + change, next_at=record.end + FEWEST,
-            reason=Status.INCONSISTENT if lately else before.reason,
-        )
+            reason=Status.INCONSISTENT if lately else before.reason)
     after = before._replace(
-        end=record.end, next_at=record.end + max(count // BLOCKS, FEWEST), kept=kept,
+        end=record.end, next_at=record.end + max(count // BLOCKS, FEWEST),
         trial=trial._replace(predicted=trial.predicted + count - new))
     look_at, look_below = before.thorough
     if record.end >= look_at or (fit.gap_std < look_below and count <= SHORT_RECORD):
-        fit, other = problem.with_intervals(fit), None
-        short = count <= SHORT_RECORD and isnan(problem.older.v)
-        if short:
+        fit = problem.with_intervals(fit)
+        if count <= SHORT_RECORD and isnan(problem.older.v):
             other = afresh(setup, record, None if kept.older is None else fit, kept.older)
-        if short or fit.spread.any():  # else it has been normal for long
             known = other is not None and setup.is_known(other, settings.REVERSALS)
             fit = mixed(problem, fit, [other] if other is not None and known else [])
+            record, fit, swapped = weighed(setup, record, fit, kept.swapped, kept.older)
+            problem = setup.problem(record, kept.older)
+            after = after._replace(kept=kept._replace(swapped=swapped))
+        elif fit.spread.any():  # else it has been normal for long
+            fit = mixed(problem, fit)
         fit = with_walk(problem, fit, setup.walk_std)
         after = after._replace(thorough=(record.end + 2 * count // 5, 0.5 * fit.gap_std))
+        if not fit.alike(held):  # nothing contradicted what was held: let the next samples decide
+            after = after._replace(trial=Trial(PREDICTED, 0, fit.noise), reason=Status.ACQUIRING)
     else:
         fit = problem.finished(fit)
     after = after._replace(coasts=coasts(problem, fit))
