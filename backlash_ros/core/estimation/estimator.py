@@ -212,8 +212,7 @@ class MovingHorizon(Law):
             self.estimate = self._estimate_of(belief, belief.published)
         if place is None or fit is None:
             return
-        if result.better is not None:
-            self._proposed = result.better
+        self._proposed = result.better or self._proposed
         if not belief.trusted and following.observer is not None:
             following.observer.settle(fit.noise)  # no fit says where the state is
             return

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from math import sqrt
+from math import inf, isnan, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -163,29 +163,34 @@ def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]
         return out, beyond
     weights, std, v = p.at(best).weights, sqrt(best.cov[2, 2]), float(p.v[0])
     likeliest, widest = p.log_posterior(best, weights), 2.0 * float(np.ptp(p.v))
+    # Where the play began may bar the way to another gap: from both of its ends as well.
+    begins = [((best.p0 - v) / best.gap, False), *[(0.0, True), (1.0, True)] * isnan(p.older.v)]
     for away in (-3.0, 3.0):
         wider, nearer, beside = np.zeros((3, 3)), 0.0, None
-        with suppress(np.linalg.LinAlgError):  # so far away that y is no number
-            for reach in away * 3.0 ** np.arange(6.0):
-                gap = best.gap + reach * std
-                if not 0.0 < gap < widest:
-                    break
-                there = replace(best, p0=v + (best.p0 - v) * gap / best.gap,
-                                theta=best.theta + best.cov[:, 2] * reach / std)
-                for _ in range(FEW_STEPS):
-                    there = p.step(there, held=True)
-                behind = max(likeliest - p.log_posterior(there, weights), 1.0)
-                if nearer <= 2.0:  # the furthest that is likely may lie well before this one
-                    more = max(0.5 / behind - reach**-2, 0.0) * apart(there, best)
-                    wider = max(wider, more, key=np.trace)
-                if not there.m > 0.0:
-                    break
-                beside = there if behind < 0.25 * reach**2 else None
-                if nearer and behind > 2.0:
-                    break
-                nearer = behind
-            if beside is not None:
-                beyond.append(p.finished(p.fitted(beside)))
+        for reach in away * 3.0 ** np.arange(6.0):
+            gap, there, value = best.gap + reach * std, best, -inf
+            if not 0.0 < gap < widest:
+                break
+            theta = best.theta + best.cov[:, 2] * reach / std
+            for share, begun in begins:
+                f = replace(best, p0=v + share * gap, theta=theta)
+                with suppress(np.linalg.LinAlgError):  # so far away that y is no number
+                    for _ in range(FEW_STEPS):
+                        f = p.step(f, held=True, begun=begun)
+                    if (of_f := p.log_posterior(f, weights)) > value:
+                        there, value = f, of_f
+            behind = max(likeliest - value, 1.0)
+            if nearer <= 2.0:  # the furthest that is likely may lie well before this one
+                more = max(0.5 / behind - reach**-2, 0.0) * apart(there, best)
+                wider = max(wider, more, key=np.trace)
+            if not there.m > 0.0:
+                break
+            beside = there if behind < 0.25 * reach**2 else None
+            if nearer and behind > 2.0:
+                break
+            nearer = behind
+        if beside is not None:
+            beyond.append(p.finished(p.fitted(beside)))
         out += 0.5 * wider
     return out, beyond
 

@@ -208,13 +208,14 @@ class Problem:
             best = self.log_posterior(f, weights)
             # Far from the optimum the error of the linearization passes for one of G.
             most = 1.0 if k < far_steps < steps else inf
-            new, there, value = self._stepped(f, best, weights, most)
+            new, there, value = self._stepped(f, best, weights, most, False, False)
             if not value > best - 0.5:
-                # A kink where the play began bars the way to all else: held there, it does not.
-                _, begun, of_begun = self._stepped(f, best, weights, most, begun=True)
-                if of_begun > value:
-                    there = replace(begun, cov=new.cov, scale=new.scale, volume=new.volume)
-                    value = of_begun
+                # A kink where the play began, or a gap that is open, bars the way to all else.
+                for held in (False, True):
+                    _, beside, of_it = self._stepped(f, best, weights, most, held, not held)
+                    if of_it > value:
+                        there = replace(beside, cov=new.cov, scale=new.scale, volume=new.volume)
+                        value = of_it
             if not value > best - 50.0:  # f stands: only its posterior is new, and its noise
                 f = replace(f, cov=new.cov, scale=new.scale, volume=new.volume)
                 noise_std = f.noise_std if f.step else self._noise_of(f)
@@ -229,22 +230,22 @@ class Problem:
         return f
 
     def _stepped(
-        self, f: WindowFit, best: float, weights: Array, most_scale: float, begun: bool = False,
+        self, f: WindowFit, best: float, w: Array, most_scale: float, held: bool, begun: bool,
     ) -> tuple[WindowFit, WindowFit, float]:
-        new = self.step(f, most_scale, begun=begun)
+        new = self.step(f, most_scale, held, begun)
         there = self._towards(f, new)
-        value = self.log_posterior(there, weights)
+        value = self.log_posterior(there, w)
         if -inf < value <= best - 0.5:
             # Beyond a kink of the play, where another side was engaged, it may be better.
-            again = self._towards(there, self.step(there, most_scale, begun=begun))
-            of_again = self.log_posterior(again, weights)
+            again = self._towards(there, self.step(there, most_scale, held, begun))
+            of_again = self.log_posterior(again, w)
             if of_again > best:
                 there, value = again, of_again
         length = 1.0
         while not value > best - 0.5 and length > 0.05:
             length *= 0.3
             there = self._towards(f, new, length)
-            value = self.log_posterior(there, weights)
+            value = self.log_posterior(there, w)
         return new, there, value
 
     def _towards(self, f: WindowFit, new: WindowFit, share: float = 1.0) -> WindowFit:

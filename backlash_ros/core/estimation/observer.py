@@ -219,11 +219,8 @@ class Following:
         if not (np.array_equal(other.denominator, own.denominator)
                 and np.array_equal(other.numerator, own.numerator)):
             return  # another G was adopted meanwhile
-        if self.observer is None:
-            self.observer = Observer(self.model, noise_std, self._gains)
-        else:
-            self.observer.settle(noise_std)
-        observer = self.observer
+        self.observer = observer = self.observer or Observer(self.model, noise_std, self._gains)
+        observer.settle(noise_std)
         self._u, self._y = deque(place.u.tolist(), ROWS), deque(place.y.tolist(), ROWS)
         self._p, self.u = place.p, estimate.m * (place.p - estimate.c_r)
         observer.place(place.x, known)

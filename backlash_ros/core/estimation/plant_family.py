@@ -64,8 +64,7 @@ class PlantFamily:
         # samples, the width of what acts half a sample late, a factor of 20 on Omega and D.
         self._scales = [
             *[(5e-3 * uncertainty, 0.1)] * self.integrates, (uncertainty * late, 40.0),
-            (0.125, inf), *[(uncertainty, 3.0)] * len(self._nominal),
-        ] if uncertainty > 0.0 else []
+            (0.125, inf), *[(uncertainty, 3.0)] * len(self._nominal)] if uncertainty > 0.0 else []
         # A leak says nothing of how wrong the rest of G is.
         self.count, self.leaks = len(self._scales), int(self.integrates and uncertainty > 0.0)
         shorter = np.poly1d([1.0, 1.0]) ** max(len(b) - 2, 0)
@@ -90,10 +89,9 @@ class PlantFamily:
 
     def _coefficients(self, xi: Sequence[complex]) -> tuple[list[complex], list[complex]]:
         """b and a at xi; beyond its limit an xi changes nothing more."""
-        moved = [
-            scale * x if abs(scale * x.real) < limit else copysign(limit, x.real)
-            for x, (scale, limit) in zip(xi, self._scales, strict=True)
-        ] or [0.0] * (2 + len(self._nominal))
+        moved = [scale * x if abs(scale * x.real) < limit else copysign(limit, x.real)
+                 for x, (scale, limit) in zip(xi, self._scales, strict=True)]
+        moved = moved or [0.0] * (2 + len(self._nominal))
         integrator = [1.0, -1.0 + (moved.pop(0) if self.leaks else 0.0)] * self.integrates
         lag, width, *logs = moved
         stable = self._stable([x + y for x, y in zip(self._nominal, logs, strict=True)])

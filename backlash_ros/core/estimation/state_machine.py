@@ -105,11 +105,10 @@ def _with_commands(
         return record, found, swapped
     sent = record, found, swapped
     for _ in range(4):
-        before = swapped
-        record, swapped = likelier(setup.problem(record), found, record, record.first, before)
-        if swapped == before:
+        record, now = likelier(setup.problem(record), found, record, record.first, swapped)
+        if now == swapped:
             break
-        found = afresh(setup, record, also=found) or found
+        swapped, found = now, afresh(setup, record, also=found) or found
     # Commands that leave more than noise explain nothing: those that were sent stay.
     noisier = found.systematic and setup.noisier(found)
     return sent if noisier else weighed(setup, record, found, swapped)
