@@ -22,8 +22,8 @@ ROOMS = (
     'identification', 'driver_check',
 )
 ESTIMATION = (
-    'settings', 'plant_family', 'posterior', 'fit', 'unmodelled', 'late_commands', 'search',
-    'explanations', 'belief', 'state_machine', 'observer', 'estimator',
+    'settings', 'plant_family', 'posterior', 'fit', 'unmodelled', 'search', 'explanations',
+    'late_commands', 'belief', 'state_machine', 'observer', 'estimator',
 )
 NUMERIC = {'numpy', 'scipy'}
 ROS_SUFFIXES = ('_msgs', '_srvs', '_interfaces')
