@@ -42,6 +42,7 @@ class LawReport:
     undecided: bool = False  # whether there is none as several gaps explain y alike
     forbidden: OutOfBounds | None = None  # what keeps a good estimate from being published
     waiting: int = 0  # samples that no fit has taken in yet
+    overdue: int = 0  # samples since the fit that is under way was due
     outliers: int = 0  # readings rejected so far
     reattributed: int = 0  # intervals so far over which another v acted than the one commanded
     failed_fits: int = 0  # fits so far without a result

@@ -136,6 +136,7 @@ class MovingHorizon(Law):
             and found.left.turns >= settings.HELD_REVERSALS,
             forbidden=outside[0] if outside else None,
             waiting=self._record.end - belief.end, outliers=self._following.outliers,
+            overdue=max(self._record.end - belief.next_at, 0) if self._channel.busy else 0,
             reattributed=self._reattributed, failed_fits=self._failed_fits)
 
     def response_std(self, z: NDArray[np.complex128]) -> Array:

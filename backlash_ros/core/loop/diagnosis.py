@@ -22,6 +22,7 @@ AGAIN_S = 10.0  # until the same cause is told once more
 LONGEST_TEXT = 99  # `ros2 topic echo` cuts off at 128, and a terminal line holds more besides
 # Share of late, lost or bad samples from which on the loop is told to suffer from them.
 TROUBLE = 0.01
+BEHIND_S = 10.0  # that a fit is late, longer than its process pauses so as to spare the loop
 UNNAMED = 'a node without a name'
 SKEW = 0.5  # of a period: time from stamp to arrival that only a wrong clock or a slow way explains
 LATE_KINDS = ('late', 'lost', 'unsent')
@@ -255,7 +256,7 @@ def causes_of(f: LoopFigures) -> tuple[Row, ...]:
     timing, status = f.timing, f.learning.status
     rate, age_s, period_s = timing.rate, timing.age_s, timing.nominal_s
     heard, due = f.heard, f.heard + f.lost
-    begins = status is None and f.silent_s == 0.0
+    begins, overdue_s = status is None and f.silent_s == 0.0, f.learning.law.overdue * period_s
 
     def waiting(topic: TopicFigures, start: str) -> str:
         return f'waiting for {topic}: ' + (f'{topic.heard[0]} is there but sends none'
@@ -321,6 +322,8 @@ def causes_of(f: LoopFigures) -> tuple[Row, ...]:
         ('worker', warn, f.dead_workers > 0, 'the process that makes the fits died '
          + (f'{f.dead_workers} times ' if f.dead_workers > 1 else '')
          + 'lately; v is not affected: check the memory'),
+        ('behind', warn, overdue_s > BEHIND_S, f'the fits are {overdue_s:.0f} s behind; v is not '
+         'affected: leave more of the machine to their process'),
     )
 
 

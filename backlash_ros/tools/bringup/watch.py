@@ -128,6 +128,6 @@ def report(axis: Axis, record: bool) -> bool:
             latency = summary['loop_latency_ms'] or {}
             print(estimate_table(summary, joint or axis.name))
             print(f'{summary["samples"]} samples, {summary["lost_samples"]} lost', *(
-                f'y to v within {ms:.2f} ms ({each})' for each, ms in latency.items()), sep=', ')
+                f'y to v {each} {ms:.2f} ms' for each, ms in latency.items()), sep=', ')
             print(f'report: {out / REPORT_PAGE}')
     return good
