@@ -40,9 +40,7 @@ def learn(setup: Setup, record: Window, before: Belief) -> Belief:
             if before.fit is not None and record.is_open:  # late commands contradict nothing
                 p, since = setup.problem(record, kept.older), before.end - setup.family.memory
                 record, swapped = likelier(p, before.fit, record, since, kept.swapped)
-                now = record.end if swapped != kept.swapped else before.thorough[0]
-                before = before._replace(kept=kept._replace(swapped=swapped),
-                                         thorough=(now, before.thorough[1]))
+                before = before._replace(kept=kept._replace(swapped=swapped))
             return look[before.state](setup, record, before)
     except np.linalg.LinAlgError:
         first = max(record.end - settings.FIRST_FIT, record.first)
