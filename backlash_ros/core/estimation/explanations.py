@@ -161,24 +161,15 @@ def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]
     out, beyond = np.zeros((3, 3)), list[WindowFit]()
     if not best.valid or not best.gap > 0.0 or not best.cov[2, 2] > 0.0:
         return out, beyond
-    weights, std, v = p.at(best).weights, sqrt(best.cov[2, 2]), float(p.v[0])
+    weights, std = p.at(best).weights, sqrt(best.cov[2, 2])
     likeliest, widest = p.log_posterior(best, weights), 2.0 * float(np.ptp(p.v))
-    # Where the play began may bar the way to another gap: from both of its ends as well.
-    begins = [((best.p0 - v) / best.gap, False), *[(0.0, True), (1.0, True)] * isnan(p.older.v)]
     for away in (-3.0, 3.0):
         wider, nearer, beside = np.zeros((3, 3)), 0.0, None
         for reach in away * 3.0 ** np.arange(6.0):
-            gap, there, value = best.gap + reach * std, best, -inf
-            if not 0.0 < gap < widest:
-                break
             theta = best.theta + best.cov[:, 2] * reach / std
-            for share, begun in begins:
-                f = replace(best, p0=v + share * gap, theta=theta)
-                with suppress(np.linalg.LinAlgError):  # so far away that y is no number
-                    for _ in range(FEW_STEPS):
-                        f = p.step(f, held=True, begun=begun)
-                    if (of_f := p.log_posterior(f, weights)) > value:
-                        there, value = f, of_f
+            if not 0.0 < theta[2] < widest:
+                break
+            value, there = _with_gap(p, best, theta, weights)
             behind = max(likeliest - value, 1.0)
             if nearer <= 2.0:  # the furthest that is likely may lie well before this one
                 more = max(0.5 / behind - reach**-2, 0.0) * apart(there, best)
@@ -193,6 +184,20 @@ def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]
             beyond.append(p.finished(p.fitted(beside)))
         out += 0.5 * wider
     return out, beyond
+
+
+def _with_gap(p: Problem, best: WindowFit, theta: Array, weights: Array) -> tuple[float, WindowFit]:
+    """The log-posterior and the likeliest fit with the gap of this theta, from where play began."""
+    v, found = float(p.v[0]), [(-inf, best)]
+    # The beginning may bar the way to another gap: from both of its ends as well, if it is open.
+    ends = [(0.0, True), (1.0, True)] * isnan(p.older.v)
+    for share, begun in [((best.p0 - v) / best.gap, False), *ends]:
+        f = replace(best, p0=v + share * float(theta[2]), theta=theta)
+        with suppress(np.linalg.LinAlgError):  # so far away that y is no number
+            for _ in range(FEW_STEPS):
+                f = p.step(f, held=True, begun=begun)
+            found.append((p.log_posterior(f, weights), f))
+    return max(found, key=lambda one: one[0])
 
 
 def outliers(z: Array) -> NDArray[np.bool_]:

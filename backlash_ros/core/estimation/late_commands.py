@@ -83,22 +83,20 @@ def likelier(
 
 
 def weighed(
-    setup: Setup, record: Window, fit: WindowFit, swapped: frozenset[int],
-    older: Prior | None = None,
+    setup: Setup, record: Window, fit: WindowFit, swapped: frozenset[int], older: Prior | None,
 ) -> tuple[Window, WindowFit, frozenset[int]]:
     """These, or the record as it was sent where that is likelier, with the spread that the other
     leaves: around a wrong fit a command may look late that was not."""
     from scipy.special import betaln  # where fits are made: 31 MB
 
     late, open_ = len(record.places(swapped)), np.isfinite(record.other).sum()
-    sent = record.swapped(swapped)
-    rival = afresh(setup, sent, None, older, also=fit) if late else None
+    rival = afresh(setup, record.swapped(swapped), None, older, also=fit) if late else None
     if rival is None or not rival.valid:
         return record, fit, swapped
     odds = float(betaln(late + 0.5, open_ - late + 0.5) - betaln(0.5, open_ + 0.5))
     ahead = fit.evidence + odds - rival.evidence
     if ahead < 0.0:
-        record, fit, rival = sent, rival, fit
-        swapped -= frozenset(range(sent.first, sent.end))
+        record, fit, rival = record.swapped(swapped), rival, fit
+        swapped -= frozenset(range(record.first, record.end))
     wider = (apart(rival, fit) + rival.crossings_cov) / (1.0 + exp(min(abs(ahead), 700.0)))
     return record, replace(fit, spread=fit.spread + wider), swapped

@@ -168,8 +168,7 @@ class Following:
     def x_hat(self) -> list[float]:
         if self.observer is not None:
             return self.observer.state
-        none: list[float] = [0.0] * self.model.order
-        return none if self.before is None else self.before.x_hat.tolist()
+        return [0.0] * self.model.order if self.before is None else [*map(float, self.before.x_hat)]
 
     def change_model(self, model: StateModel, gains: Sequence[Gain]) -> None:
         self.model, self._gains = model, gains

@@ -141,8 +141,7 @@ class WindowFit:
 
     @property
     def xi(self) -> list[float]:
-        out: list[float] = self.theta[3:].tolist()
-        return out
+        return list(map(float, self.theta[3:]))
 
     @property
     def evidence(self) -> float:

@@ -109,7 +109,7 @@ def _with_commands(
         swapped, found = now, afresh(setup, record, also=found) or found
     # Commands that leave more than noise explain nothing: those that were sent stay.
     noisier = found.systematic and setup.noisier(found)
-    return sent if noisier else weighed(setup, record, found, swapped)
+    return sent if noisier else weighed(setup, record, found, swapped, None)
 
 
 def _why(setup: Setup, found: WindowFit | None, record: Window, before: Belief) -> Status:
@@ -180,8 +180,9 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
             known = other is not None and setup.is_known(other, settings.REVERSALS)
             fit = mixed(problem, fit, [other] if other is not None and known else [])
             record, fit, swapped = weighed(setup, record, fit, kept.swapped, kept.older)
-            problem = setup.problem(record, kept.older)
-            after = after._replace(kept=kept._replace(swapped=swapped))
+            if swapped != kept.swapped:
+                problem = setup.problem(record, kept.older)
+                after = after._replace(kept=kept._replace(swapped=swapped))
         elif fit.spread.any():  # else it has been normal for long
             fit = mixed(problem, fit)
         fit = with_walk(problem, fit, setup.walk_std)

@@ -23,7 +23,7 @@ from backlash_ros.core.identification.structure_search import Options, Progress,
 from backlash_ros.core.identification.verdict import CERTAIN, Findings, Verdict, judge
 from backlash_ros.core.plant.actuator import Actuator
 from backlash_ros.core.plant.transfer_function import Array
-from backlash_ros.core.records.readings import busiest, check_record, frequencies_of, quantum
+from backlash_ros.core.records import readings
 
 
 class Details(NamedTuple):
@@ -113,8 +113,8 @@ def identify(
     """
     options = options or Options()
     v, y = np.asarray(v, dtype=float), np.asarray(y, dtype=float)
-    check_record(v, y)
-    part = busiest(v, y)
+    readings.check_record(v, y)
+    part = readings.busiest(v, y)
     nothing = _why_nothing(v, y[part], options)
     if nothing:
         return Identification(sample_period, v, y, refused=nothing)
@@ -195,7 +195,7 @@ def _described(s: StructureSearch, given: Identification, options: Options) -> I
     covariance = models.covariance_of(best.problem, best.fit)
     c_r, (gap_var, c_r_var, c_l_var) = _crossings(best, covariance, units)
     g = models.response_of(best, covariance, units.y_size / units.v_size)
-    low, high = frequencies_of(best.run.y)
+    low, high = readings.frequencies_of(best.run.y)
     low = max(low, np.pi / len(best.run.y))
     frequencies = np.geomspace(low, max(high, 1.01 * low), 60, dtype=np.float64)
     spread, gain_std = g.std(frequencies), float(g.std(np.zeros(1))[0])
@@ -204,9 +204,9 @@ def _described(s: StructureSearch, given: Identification, options: Options) -> I
     observed, total = search.observed_of(s.samples, best), float(g.numerator.sum())
     static = total if structure.integrator else total / float(g.denominator.sum())
     # Where no structure explains all, likelihoods say little: as likely are all that predict as
-    # well. A normal deviation is 1.48 times the median distance, which no single one spoils.
+    # well. A single one does not spoil the median of their distances.
     alike = search.predictors(s.compared) if observed.unexplained else []
-    apart = max(s.apart, 1.4826 * float(np.median(
+    apart = max(s.apart, readings.TO_STD * float(np.median(
         [abs(one.whole.gap - best.gap) for one in alike] or [0.0])))
     verdict = judge(Findings(
         observed, sqrt(gap_var), units.v_size * apart, sqrt(c_r_var),
@@ -231,7 +231,8 @@ def _described(s: StructureSearch, given: Identification, options: Options) -> I
             (*best.denominator.tolist(), *[0.0] * at_zero), structure.delay, delays,
             structure.integrator, frequencies, spread, _as_parameter(2.0 * float(spread.max())),
             units.y_size * sqrt(best.squares / max(len(best.left) - structure.unknowns, 1)),
-            quantum(observed.y), int((np.isfinite(given.y) & np.isnan(s.samples.y)).sum())),
+            readings.quantum(observed.y),
+            int((np.isfinite(given.y) & np.isnan(s.samples.y)).sum())),
         details=Details(s.samples.first, units.v + units.v_size * best.problem.v, observed, g,
                         s.held_out))
 

@@ -152,6 +152,7 @@ class Observed:
         self.rms = float(np.sqrt(np.nanmean(self.residual**2)))
         self.swing = float(np.nanmax(self.y) - np.nanmin(self.y))
         self.family = LinearFamily(self.v[:4000], self.y[:4000])
+        self._candidates: dict[Callable[..., Array], Candidate] = {}
         self.unexplained = self.family.enough and \
             self.rms > max(1.5 * self.noise, 1e-3 * self.swing)
 
@@ -164,8 +165,13 @@ class Observed:
     @cached_property
     def plays(self) -> Candidate:
         """The best many plays in parallel."""
-        return self.family.best(_many, [
-            (widest, share) for widest in (0.1, 0.3, 0.7) for share in (0.0, 0.4)])
+        return self.best(_many, PARALLEL)
+
+    def best(self, nonlinearity: Callable[..., Array], starts: Sequence[At]) -> Candidate:
+        """The best of this nonlinearity from these starts, which is looked for once."""
+        if nonlinearity not in self._candidates:
+            self._candidates[nonlinearity] = self.family.best(nonlinearity, starts)
+        return self._candidates[nonlinearity]
 
 
 # --- nonlinearities of v (N,), scaled to 0 to 1, and what is said of them -------------------------
@@ -307,6 +313,8 @@ def _creep(o: Observed) -> str:
             'or y drifts')
 
 
+PARALLEL = [(widest, share) for widest in (0.1, 0.3, 0.7) for share in (0.0, 0.4)]  # of _many
+
 # --- what is compared -----------------------------------------------------------------------------
 
 # A nonlinearity, where to begin (of the width of the best play), what to say of it by its
@@ -330,7 +338,7 @@ NONLINEARITIES: tuple[tuple[
      lambda _: [(width,) for width in (0.003, 0.01, 0.03, 0.1, 0.2, 0.4)],
      'y leads v by {:.3g} where v turns: the drive compensates a backlash already, by too much',
      'switch that off, or leave it to it'),
-    (_many, lambda _: (),
+    (_many, lambda _: PARALLEL,
      'many plays in parallel explain it, up to {:.3g} wide: y turns smoothly, as with friction '
      'along the way or in a piezo', 'only a single backlash is compensated here'),
     (_sticking, lambda width: [(wider * width, share * width) for wider, share in (
@@ -356,8 +364,7 @@ def best_other(o: Observed) -> Answer | None:
     """The best of the nonlinearities that explain y far better than a play does."""
     f, named = o.family, []
     for nonlinearity, starts, said, cure in NONLINEARITIES:
-        best = o.plays if nonlinearity is _many else f.best(
-            nonlinearity, starts(abs(o.one_play.at[0])))
+        best = o.best(nonlinearity, starts(abs(o.one_play.at[0])))
         if f.beats(best, o.one_play, o.noise):
             at = f.swing * np.array(best.at)
             named.append((best.squares, said.format(*np.abs(at), places=f.low + at), cure))

@@ -164,7 +164,7 @@ def test_commands_that_look_late_are_weighed_against_those_expected(late: bool) 
     looked = Window(0, v, y, other) if late else Window(0, v, y, other).swapped(frozenset({100}))
     fit = afresh(setup, looked)
     assert fit is not None
-    record, found, swapped = weighed(setup, looked, fit, frozenset({100}))
+    record, found, swapped = weighed(setup, looked, fit, frozenset({100}), None)
     assert swapped == (frozenset({100}) if late else frozenset())
     np.testing.assert_array_equal(record.v, v)
     assert abs(found.gap - 1.0) < 5.0 * found.gap_std < 0.5

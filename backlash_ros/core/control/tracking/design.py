@@ -290,12 +290,12 @@ def modulus_margin(
             loop[-1, 0], loop[-1, -1] = -plant.c, 1.0
         if not np.abs(np.linalg.eigvals(loop)).max() < 1.0:
             return 0.0
-        # Opened at u, of which the observer is told all, that of q too.
+        # Opened at u, all of which the observer knows, what comes of q as well.
         closed = believed - np.outer(drive, gain[n:-1])
         closed -= np.outer(correction, seen @ closed)
         by_integral = gains.integral / (z - 1.0)
-        told = (drive - correction * (seen @ drive))[:, None] * by_integral[:, None, None]
-        x_hat = np.linalg.solve(at * np.eye(len(drive)) - closed, at * correction[:, None] + told)
+        of_q = (drive - correction * (seen @ drive))[:, None] * by_integral[:, None, None]
+        x_hat = np.linalg.solve(at * np.eye(len(drive)) - closed, at * correction[:, None] + of_q)
         minus_u = (gain[n:-1] @ x_hat)[:, 0] - by_integral
         least = min(least, float(np.abs(1.0 + factor * response * minus_u).min()))
     return least

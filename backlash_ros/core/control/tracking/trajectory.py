@@ -173,14 +173,15 @@ class IdealTrajectory:
             return False
         # Another one has to win a factor of two: how large the noise is, is known no better. What
         # softer ones leave is the reference itself.
-        hardest = next((i for i, gain in enumerate(of_noise[:now]) if 2.0 * gain <= most), now)
         if of_noise[now] > most:
-            softer = next((i for i, gain in enumerate(of_noise) if gain <= most),
-                          of_noise.index(min(of_noise)))
-            hardest = softer if 2.0 * of_noise[softer] <= of_noise[now] else now
-        if hardest == now:
+            other = next((i for i, gain in enumerate(of_noise) if gain <= most),
+                         of_noise.index(min(of_noise)))
+            other = other if 2.0 * of_noise[other] <= of_noise[now] else now
+        else:
+            other = next((i for i, gain in enumerate(of_noise[:now]) if 2.0 * gain <= most), now)
+        if other == now:
             return False
-        self.use(self.design, hardest)
+        self.use(self.design, other)
         return True
 
     def replay(self) -> None:
