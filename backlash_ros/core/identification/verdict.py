@@ -150,9 +150,9 @@ def _coasts(f: Findings) -> Iterator[Doubt]:
     """Where a load that runs on within the gap explains y better, with another gap."""
     o = f.observed
     if o.rms > 1.1 * o.noise and o.family.enough:
-        width = o.one_play.at[0]
+        # A play that explains a load that coasts to rest best has no width at all.
         best = o.family.best(coasting, [
-            (start, *brakes) for start in (width, 1.3 * width, 1.3 * f.gap / o.family.swing)
+            (start, *brakes) for start in (0.01, 0.03, 0.1, 0.3, 1.3 * o.one_play.at[0])
             for brakes in ((0.0, 0.0), (3e-4, 0.0), (3e-3, 0.0), (0.0, 0.03), (0.0, 0.2))], 100)
         gap = abs(best.at[0]) * o.family.swing
         share = min(o.family.share(best, o.one_play, o.noise), 1.0)

@@ -108,13 +108,14 @@ def test_what_is_no_play_is_named_first() -> None:
     assert not found.backlash.known
 
 
-def test_a_load_that_coasts_is_told_with_the_gap_that_it_hides() -> None:
+@pytest.mark.parametrize(('kept', 'gap'), [(0.97, 0.5), (0.999, 1e-9)])
+def test_a_load_that_coasts_is_told_with_the_gap_that_it_hides(kept: float, gap: float) -> None:
     half, u = 0.5 * GAP, [V[0], V[0]]
     for value in V[1:]:
         # On by what is left of the last step, as far as the sides of the gap let it.
-        on = u[-1] + 0.97 * (u[-1] - u[-2])
+        on = u[-1] + kept * (u[-1] - u[-2])
         u.append(min(max(on, value - half), value + half))
-    found = judge(FOUND._replace(observed=observed(V, behind(np.array(u[1:]), 'lag'), 0.5)))
+    found = judge(FOUND._replace(observed=observed(V, behind(np.array(u[1:]), 'lag'), gap)))
     assert not found.backlash.known
     reason, _, hidden = found.backlash.reason.partition('the load coasts while v crosses the gap')
     assert reason
