@@ -368,6 +368,7 @@ def _smoothed(found: Model, silent: Array, noise_variance: float) -> Model:
     pull = covariance @ rows.T @ rows
     for weight in 1e6 / max(float(np.trace(pull)), 1e-300) * 0.0625 ** np.arange(12.0):
         theta = np.linalg.solve(np.eye(len(pull)) + weight * pull, found.fit.theta)
+        theta[2] = theta[2] if theta[2] > 0.0 else found.gap  # a line knows no end of the gaps
         fit = replace(found.fit, theta=theta)
         if not np.isfinite(found.structure.at(fit.xi)[1]).all():
             continue  # a pole has left the unit circle

@@ -334,8 +334,9 @@ NONLINEARITIES: tuple[tuple[
      'v does nothing from {places[0]:.4g} to {places[1]:.4g}, from wherever it comes: a dead '
      'zone, which has no memory, and no backlash',
      'remove it where it is made, it is not compensated here'),
-    (lambda v, width: 2.0 * v - centred(v, width),  # play, compensated twice
-     lambda _: [(width,) for width in (0.003, 0.01, 0.03, 0.1, 0.2, 0.4)],
+    # All at once where v turns, or over some of its way.
+    (lambda v, lead, way: v + abs(lead) * (v - centred(v, way)) / max(abs(way), 1e-9),
+     lambda _: [(lead, lead) for lead in (0.003, 0.01, 0.03, 0.1, 0.2, 0.4)],
      'y leads v by {:.3g} where v turns: the drive compensates a backlash already, by too much',
      'switch that off, or leave it to it'),
     (_many, lambda _: PARALLEL,

@@ -73,6 +73,12 @@ def test_delays_that_contradict_each_other_where_each_is_sure_leave_the_gentler_
     assert found.model.delay == case.delay
 
 
+def test_no_gap_that_is_told_is_negative() -> None:
+    v = motion(1600)
+    u = v + 0.04 * np.sign(np.diff(v, prepend=v[0]))
+    assert identify(v, answer(u, 0.0, 0.0, 2e-3), PERIOD_S).gap > 0.0
+
+
 def test_lost_samples_and_outliers_do_not_matter() -> None:
     v, y = record()
     rng = np.random.default_rng(3)

@@ -65,6 +65,8 @@ OTHERS: dict[str, tuple[Callable[[Array], Array], str]] = {
     'the same on one side': (lambda v: np.minimum(play(v, 0.3), 1.2), 'the load slides there'),
     'dead zone': (dead_zone, 'a dead zone'),
     'compensated already': (lambda v: 2.0 * v - play(v, 0.3), 'the drive compensates'),
+    'compensated at once': (
+        lambda v: v + 0.15 * np.sign(np.gradient(v)), 'the drive compensates'),
     'plays in parallel': (
         lambda v: 0.3 * v + sum(0.14 * play(v, w) for w in (0.4, 0.9, 1.5, 2.2, 3.0)),
         'plays in parallel'),
