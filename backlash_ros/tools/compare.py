@@ -111,7 +111,10 @@ def make_parser() -> argparse.ArgumentParser:
 def _compare(args: Sequence[str] | None) -> None:
     options = make_parser().parse_args(args)
     scenario = effective_parameters(options.config, options.settings, options.seed, options.axis)
-    results = compare(scenario, cli.number_of_samples(scenario, options.duration))
+    samples = cli.number_of_samples(scenario, options.duration)
+    if options.out is not None:
+        result_directory(options.out)  # fails before long runs, not after them
+    results = compare(scenario, samples)
     # Drawing libraries take a second to load, which bad input should not cost.
     from backlash_ros.tools.figures import draw_error_curves, png
     rows = [(each.name, *(cli.number(merit, 3) for merit in each.merits)) for each in results]

@@ -128,7 +128,7 @@ def parse_setting(text: str) -> tuple[str, str, Value]:
     """Return the checked content of `KEY=VALUE` or `AXIS/KEY=VALUE`, the value as in YAML."""
     key, equals, given = text.partition('=')
     axis, slash, name = key.strip().rpartition('/')
-    if not equals or (slash and not axis):
+    if not (equals and name) or (slash and not axis):
         raise InputError(f'--set {text!r} must be KEY=VALUE or AXIS/KEY=VALUE')
     check_names([name])
     try:

@@ -98,6 +98,9 @@ def _opened(path: Path, options: argparse.Namespace, span: cli.Span) -> Source:
 
 
 def _replayed(source: Source) -> RunRecord:
+    period, of_run = source.parameters.sample_period, source.recorded.sample_period
+    if abs(period / of_run - 1.0) >= 0.01:
+        raise ParameterError('sample_period', period, f'must be that of {source.path}, {of_run:g}')
     try:
         return replay(source.recorded, source.parameters, source.reports)
     except ParameterError:
@@ -108,8 +111,8 @@ def _replayed(source: Source) -> RunRecord:
 
 def _one(source: Source, out: Path | None) -> None:
     recorded = source.recorded
-    cli.print_warnings('replay', source.parameters)
     replayed = _replayed(source)
+    cli.print_warnings('replay', source.parameters)
     directory = result_directory(out)
     summary = write_report(Run(replayed, source.parameters), directory)
     write_atomically(directory / 'replay.png',

@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import os
 import zipfile
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -44,6 +45,8 @@ def result_directory(out: Path | None) -> Path:
         results.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f'{results}: cannot be made a folder: {error.strerror}') from None
+    if not os.access(results, os.W_OK):
+        raise InputError(f'{results}: cannot be written into: choose another --out')
     if out is not None:
         return out
     name = datetime.now(timezone.utc).strftime('%Y-%m-%dT%H-%M-%SZ')

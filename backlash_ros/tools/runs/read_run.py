@@ -49,7 +49,8 @@ def read_run(
     inside = (path / RECORD_FILE, path / SAMPLES_FILE)
     file = next(filter(Path.is_file, inside), path)
     if not file.is_file() or file.suffix not in ('.npz', '.csv'):
-        raise InputError(f'{path}: holds no bag, no {RECORD_FILE} and no {SAMPLES_FILE}')
+        raise InputError(f'{path}: holds no bag, no {RECORD_FILE} and no {SAMPLES_FILE}: '
+                         'name a bag, or the folder of one run of bringup or simulate')
     record = files.read_record(file) if file.suffix == '.npz' else files.read_samples(file, period)
     if span == WHOLE_SPAN:
         return Run(record, parameters)

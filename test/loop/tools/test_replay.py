@@ -88,7 +88,7 @@ def test_the_command_says_that_nothing_parts_or_where(recorded, tmp_path, capsys
 @pytest.mark.parametrize('arguments', [
     [], ['nowhere'], ['RUN', '--set', 'nothing=1'], ['RUN', '--set', 'x/amplitude=1'],
     ['RUN', '--sweep', 'amplitude'], ['RUN', '--from', '2', '--to', '1'],
-    ['RUN', '--set', 'estimator.bounds.m=[2.0, 3.0]'],
+    ['RUN', '--set', 'estimator.bounds.m=[2.0, 3.0]'], ['RUN', '--set', 'sample_period=0.1'],
 ])
 def test_bad_input_is_told_in_one_line(recorded, tmp_path, capsys, arguments):
     given = [str(recorded) if word == 'RUN' else word for word in arguments]

@@ -124,7 +124,7 @@ def other_bag(path: Path, run: RunRecord) -> None:
     (other_bag, 'holds no message of controller/signals; its topics are /chatter'),
     (lambda path, run: made_bags.write_bag(path, RunRecord(run.rows[:0], run.sample_period)),
      'holds no message of controller/signals'),
-    (lambda path, run: path.mkdir(), 'holds no bag, no record.npz and no samples.csv'),
+    (lambda path, run: path.mkdir(), 'or the folder of one run of bringup or simulate'),
     (lambda path, run: path.touch(), 'holds no table: give rows of numbers'),
 ])
 def test_unusable_input_is_one_line_and_leaves_nothing(

@@ -135,7 +135,7 @@ def test_setting_is_read_like_a_line_of_yaml(text: str, expected: tuple[str, obj
 
 
 @pytest.mark.parametrize(('text', 'message'), [
-    ('seed', 'must be KEY=VALUE'), ('/seed=1', 'must be KEY=VALUE'),
+    *((text, 'must be KEY=VALUE') for text in ('seed', '/seed=1', '=1')),
     ('sed=1', 'did you mean seed'), ('x/sed=1', 'did you mean seed'),
     ('axes=[on]', 'quote true, on'), ('axes=[a/b]', 'must be a list of names'),
     ('structure=square', 'must be one of'),

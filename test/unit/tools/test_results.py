@@ -102,6 +102,9 @@ def test_latest_points_at_the_newest_folder(tmp_path, monkeypatch):
     assert latest.resolve() == folders[-1].resolve()
     # Relative, so that the results can be moved.
     assert str(latest.readlink()) == folders[-1].name
+    monkeypatch.setattr(results.os, 'access', lambda *_: False)
+    with pytest.raises(InputError, match='choose another --out'):
+        results.result_directory(latest)
 
 
 def test_file_is_replaced_whole_or_not_at_all(tmp_path: Path) -> None:
