@@ -34,8 +34,8 @@ def write_report(run: files.Run, out: Path) -> dict[str, Any]:
     notes, lost = list(run.notes), summary['lost_samples']
     if lost > 0.01 * (total := lost + summary['samples']) \
             and not (run.parameters and run.parameters.output_loss):
-        notes.append(f'{lost} of {total} samples were lost: is the machine too busy for this '
-                     'sample period?')
+        notes.append(f'{lost} of {total} samples were lost: was the machine too busy for '
+                     'this sample period, or the driver or its sensor silent?')
     # Of a log, which has no estimates, it is what was made of its rows.
     of_log = np.isnan(run.record.column('m')[-1])
     for note in notes:

@@ -24,6 +24,7 @@ from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 
 from backlash_ros import topics
 from backlash_ros.core.loop.diagnosis import UNNAMED, Finding, Level, LevelLog
+from backlash_ros.nodes.runtime.process import emit
 
 # Deep enough that a recorder which is held up for a second misses nothing.
 DEPTH = 1000
@@ -93,6 +94,7 @@ class DiagnosticsPublisher:
             log.warning(line)
         else:
             log.error(line)
+            emit('complaint', text=line)
 
 
 def line_of(joint: str, text: str) -> str:

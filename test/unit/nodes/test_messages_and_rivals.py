@@ -4,6 +4,7 @@ import struct
 from math import inf, nan
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import yaml
@@ -46,10 +47,17 @@ def test_a_profile_of_the_user_stays(tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_a_number_goes_out_and_comes_in_as_a_float64(number: float) -> None:
     assert repr(deserialize_message(messages.message_with(number), Float64).data) == repr(number)
     assert repr(messages.number_of(serialize_message(Float64(data=number)))) == repr(number)
+    of_highest_byte_first = b'\x00\x00\x00\x00' + struct.pack('>d', number)
+    assert repr(messages.number_of(of_highest_byte_first)) == repr(number)
 
 
-def test_a_sender_whose_highest_byte_comes_first_is_understood() -> None:
-    assert messages.number_of(b'\x00\x00\x00\x00' + struct.pack('>d', -7.25)) == -7.25
+def test_an_error_is_told_to_who_started_the_node(monkeypatch):
+    told = Mock()
+    monkeypatch.setattr(messages, 'emit', told)
+    monkeypatch.setattr(messages.Node, 'get_logger', Mock())
+    for level in messages.Level:
+        messages.DiagnosticsPublisher._write(Mock(_part='waist'), level, 'it stands still')
+    told.assert_called_once_with('complaint', text='waist: it stands still')
 
 
 JOINTS = (

@@ -127,10 +127,7 @@ def other_bag(path: Path, run: RunRecord) -> None:
     (lambda path, run: path.mkdir(), 'or the folder of one run of bringup or simulate'),
     (lambda path, run: path.touch(), 'holds no table: give rows of numbers'),
 ])
-def test_unusable_input_is_one_line_and_leaves_nothing(
-    run: RunRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str], make: object, message: str,
-) -> None:
+def test_unusable_input_leaves_a_line_alone(run, tmp_path, monkeypatch, capsys, make, message):
     monkeypatch.chdir(tmp_path)
     if callable(make):
         make(tmp_path / 'bag', run)
