@@ -251,7 +251,7 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
         turn = next(self.loops.turns)
         if steps and (turn or self._steps.heard):
             period_s = self.settings.sample_period
-            if next(iter(outputs.values())).received_ns > time.time_ns() - period_s * 1e9:
+            if next(iter(outputs.values())).received_ns > self._io.now_ns() - period_s * 1e9:
                 # On a busy processor the driver, woken by the command, would have to wait.
                 time.sleep(0.05 * period_s)
             if turn:

@@ -15,6 +15,7 @@ from backlash_ros.core.loop.control_loop import Driver as Asked
 from backlash_ros.core.loop.diagnosis import Level, Neighbours, figures_of_loop, findings_of
 from backlash_ros.core.loop.loop_statistics import Lately
 from backlash_ros.core.loop.sample_counter import SampleCounter, kept_outputs
+from backlash_ros.core.loop.wall_clock import WallClock
 
 
 class Controller:
@@ -34,13 +35,14 @@ class Controller:
     def restart(self, inherited: Estimate | None, v: float | None) -> None:
         """Another process takes over. v: control.initial, None where it is not set."""
         self._counter = SampleCounter(self.p.sample_period, from_zero=False)
+        self._clock = WallClock()
         self._configure(inherited, v)
         self.active = True
 
     def _configure(self, inherited: Estimate | None, v: float | None) -> None:
         driver = self.driver
         asked = Asked(
-            lambda: driver.answered_ns, may_report=lambda: driver.reports,
+            lambda: driver.answered_ns - self._clock.set_ns, may_report=lambda: driver.reports,
             steady_s=lambda: driver.tick * self.p.sample_period,
         )
         self.loop = ControlLoop(self.p, self._send, asked, inherited, self._counter, v)
@@ -74,14 +76,18 @@ class Controller:
             loop.take_reference(y_m)
         if driver.tick < self.stalled_until:
             return
+        self._clock.look(driver.answered_ns, driver.answered_ns - driver.offset_ns)
+        set_ns = self._clock.set_ns
         for v, stamp_ns in driver.applied:
-            loop.take_applied(v, stamp_ns)
+            loop.take_applied(v, stamp_ns - set_ns)
         driver.applied.clear()
         outputs = driver.outputs[-kept_outputs(self.p.sample_period):]
         driver.outputs.clear()
         if not self.active:
             return
-        for i, output in enumerate(outputs):
+        for i, o in enumerate(outputs):
+            output = o._replace(stamp_ns=o.stamp_ns - set_ns, sent_ns=o.sent_ns - set_ns,
+                                received_ns=o.received_ns - set_ns)
             begins, core = loop.begins, loop.core
             step = loop.answer(output)
             if step is not None:

@@ -38,6 +38,7 @@ class Driver(NamedTuple):
     """What a loop can ask about its driver: the clock of its stamps, who else tells of it.
 
     applied: the name of its reports of v. warn: tells the user. steady_s: a clock nobody sets [s].
+    wall_ns: the clock of sending and receiving.
     """
 
     now_ns: Callable[[], int]
@@ -45,6 +46,7 @@ class Driver(NamedTuple):
     applied: str = 'applied_control'
     warn: Callable[[str], object] = lambda text: None
     steady_s: Callable[[], float] = time.monotonic
+    wall_ns: Callable[[], int] = time.time_ns
 
 
 @dataclass
@@ -140,9 +142,9 @@ class ControlLoop:
             return None
         step = self._step_core(output.y, y_m, output.stamp_ns)
         self.send(step.v)
-        self.statistics.note(
-            output.y, step.v, self.core.inverse.limited,
-            step.estimate.status is Status.INCONSISTENT, (time.time_ns() - output.sent_ns) * 1e-9)
+        took_s = (self.driver.wall_ns() - output.sent_ns) * 1e-9
+        self.statistics.note(output.y, step.v, self.core.inverse.limited,
+                             step.estimate.status is Status.INCONSISTENT, took_s)
         return step
 
     def skip(self, arrival: Arrival) -> None:
@@ -326,9 +328,8 @@ class JointLoops:
     """Answers a message about all joints with one of commands for all; no loop knows another.
 
     driver: what can be asked about that of a joint. before: estimates to begin with, of joints that
-    do not begin with what was known before. by_name: the loops, in the order of `joints`; a
-    single one may be nameless. turns: for each sample the loop that may look after fits then, or
-    none.
+    do not begin with what was known before. by_name: in the order of `joints`; a single one may be
+    nameless. turns: for each sample the loop that may look after fits then, or none.
     """
 
     def __init__(

@@ -221,6 +221,7 @@ class SampleCounter:
         self._lateness_ns: deque[float] = deque(maxlen=20)  # before any shift
         self._shifted_ns = 0.0  # by how much due_ns was shifted so far
         self._on_time = 0  # samples that came when they were due, less the early ones
+        self._early = False  # whether any came early
         self._strange = 0  # messages in a row that do not follow the newest sample
 
     def count(self, stamp_ns: int, sequence: int = UNNUMBERED, numbered: bool = True,
@@ -269,6 +270,12 @@ class SampleCounter:
         if missing == 0 and not keeps_time:
             # One that came early outweighs two that were due.
             self._on_time = max(self._on_time + (-2 if is_early else 1), 0)
+            self._early = self._early or is_early
+            if self._early and self._on_time == 20:
+                # It keeps time: those that came early were none, and the count until now is wrong.
+                arrival = self._of_another(stamp_ns, sequence, at_once=True)
+                self._on_time = 20
+                return arrival
         self._sequence = self._repeated = sequence
         self._stamp_ns, self._strange = stamp_ns, 0
         self._follow_phase(stamp_ns, missing, 20 if self._on_time >= 20 else 6)
@@ -310,7 +317,7 @@ class SampleCounter:
         self._stamp_ns = stamp_ns
         self._lateness_ns.clear()
         self.sender.restart(stamp_ns)
-        self._on_time = self._strange = 0
+        self._on_time, self._early, self._strange = 0, False, 0
 
 
 def kept_outputs(sample_period: float) -> int:

@@ -18,6 +18,7 @@ from backlash_ros import topics
 from backlash_ros.core.loop import diagnosis
 from backlash_ros.core.loop.control_loop import Driver
 from backlash_ros.core.loop.sample_counter import Output, Timing
+from backlash_ros.core.loop.wall_clock import WallClock
 from backlash_ros.core.parameters import ParameterError, Parameters
 from backlash_ros.nodes.runtime.executor import serve_polled
 from backlash_ros.nodes.runtime.messages import (
@@ -97,6 +98,7 @@ class DriverIo:
         self.simulated_time = bool(node.get_parameter('use_sim_time').value)
         self._node, self._p = node, p
         self._stamp = 0, 0  # in the header of the newest y, and the number of its message
+        self.clock = WallClock()
         self._repeats_stamps = False  # since then the time of sending counts
         self._newest: dict[str, float] = {}  # v by joint
         self._referred = JointMessage()  # the newest message of references
@@ -115,16 +117,18 @@ class DriverIo:
                 self._node.log.warning(line_of(joint, text))
 
         return Driver(self.now_ns, lambda: self.has_reports and not self.is_simulated,
-                      self.topics.applied, warn_once)
+                      self.topics.applied, warn_once,
+                      wall_ns=lambda: time.time_ns() - self.clock.set_ns)
 
     def now_ns(self) -> int:
         # time.time_ns() is the system clock of ROS, without the detour.
         return self._node.get_clock().now().nanoseconds if self.simulated_time \
-            else time.time_ns()
+            else time.time_ns() - self.clock.set_ns
 
     def stamp_ns(self, info: dict[str, Any]) -> int:
         """When a message left."""
-        return self.now_ns() if self.simulated_time else int(info['source_timestamp'])
+        return self.now_ns() if self.simulated_time \
+            else int(info['source_timestamp']) - self.clock.set_ns
 
     def known_of(self, timing: Timing) -> Timing:
         # Those of simulated time have nothing to do with the time of arrival.
@@ -138,6 +142,7 @@ class DriverIo:
         def hear_output(
             values: dict[str, float], info: dict[str, Any], message: float | JointMessage,
         ) -> None:
+            self.clock.look_now()
             stamp_ns, number = 0, info['publication_sequence_number']
             of_joints = isinstance(message, JointMessage)
             if isinstance(message, JointMessage):
@@ -154,8 +159,10 @@ class DriverIo:
                         or self._node.count_publishers(self.topics.output) == 1
                 stamp_ns = 0 if self._repeats_stamps else message.stamp_ns
             # Drivers that leave the header empty are known by the stamp of the middleware.
-            known = (stamp_ns or self.stamp_ns(info), info['source_timestamp'],
-                     info['received_timestamp'], number, not of_joints)
+            set_ns = self.clock.set_ns
+            known = (stamp_ns - set_ns if stamp_ns else self.stamp_ns(info),
+                     info['source_timestamp'] - set_ns, info['received_timestamp'] - set_ns,
+                     number, not of_joints)
             hear({joint: Output(y, *known) for joint, y in values.items()})
 
         return self.listen_to(self.topics.output, hear_output, output_qos(self._p, depth), polled)

@@ -155,18 +155,34 @@ def test_the_first_command_goes_on_from_what_is_known_of_v(reports, initial):
     assert np.abs(np.diff([STANDING, *world.sent])).max() <= STEP
 
 
-@pytest.mark.parametrize(('jump_s', 'interruptions', 'lost'), [
-    (0.21, 1, 21), (-0.2, 1, 0), (0.1, 0, 10),
+@pytest.mark.parametrize(('jump_s', 'own', 'interruptions', 'lost'), [
+    *((jump_s, True, 0, 0) for jump_s in (3600.0, 0.1, 0.004, -0.004, -0.2)),
+    (0.21, False, 1, 21), (-0.2, False, 1, 0), (0.1, False, 0, 10),
 ])
-def test_a_clock_that_is_set_is_an_interruption_or_taken_for_lost_outputs(
-    jump_s: float, interruptions: int, lost: int,
+def test_a_clock_that_is_set_counts_only_where_it_is_that_of_another_machine(
+    jump_s: float, own: bool, interruptions: int, lost: int,
 ) -> None:
     world = SimulatedLoop(**{'estimator.law': 'fixed', 'timeout.plant_output': 0.2})
     world.run(100)
-    world.driver.offset_ns += round(jump_s * 1e9)
+    jump_ns = round(jump_s * 1e9)
+    if own:
+        world.driver.offset_ns += jump_ns
+    else:
+        world.fault = lambda k, output: [output._replace(stamp_ns=output.stamp_ns + jump_ns)]
     world.run(100)
     statistics = world.loop.statistics
     assert (statistics.interruptions, statistics.lost) == (interruptions, lost)
+    assert statistics.used == (200 - lost if own else statistics.used)
+
+
+def test_a_driver_that_repeats_outputs_from_the_start_is_counted_anew() -> None:
+    world = SimulatedLoop(**{'estimator.law': 'fixed'})
+    world.driver.repeats = True
+    world.run(200)
+    assert world.loop.statistics.interruptions == 1
+    before = world.loop.counter.index
+    world.run(100)
+    assert world.loop.counter.index == before + 100
 
 
 def test_a_take_up_rate_that_is_set_live_is_how_fast_v_crosses_the_gap() -> None:
