@@ -214,10 +214,7 @@ def _described(s: StructureSearch, given: Identification, options: Options) -> I
         # Whatever the correlation: what explains nine tenths of y shows v.
         inf if best.squares < 0.1 * still.squares
         else 0.5 * still.behind(best, models.effective(best.left)),
-        [(units.v_size * rival, behind) for rival, behind in s.rivals],
-        # Where many fit alike, the gap does not depend on the delay.
-        structure.delay * (structure.delay == max(s.delays) and len(delays) < 3
-                           and _delay_open(s))))
+        [(units.v_size * rival, behind) for rival, behind in s.rivals], *_open_delay(s)))
     # What no model explains moves both sides of the gap alike.
     more = 0.25 * (verdict.gap_std**2 - gap_var)
     # As parameters have it: z where G is a gain, for B acts a sample late.
@@ -237,13 +234,17 @@ def _described(s: StructureSearch, given: Identification, options: Options) -> I
                         s.held_out))
 
 
-def _delay_open(s: StructureSearch) -> bool:
-    """Whether one more sample of delay fits as well."""
+def _open_delay(s: StructureSearch) -> tuple[int, float]:
+    """The delay, if it is the longest that was compared and one more sample fits as well, else 0;
+    and by how much that moves the gap [v]."""
     samples, taken = replace(s.samples, first=s.samples.first + 1), s.best.structure
+    if not 0 < taken.delay == max(s.delays):
+        return 0, 0.0
     this, other = (fitted(samples, structure, s.best.begin())
                    for structure in (taken, replace(taken, delay=taken.delay + 1)))
-    rows = models.effective(this.left)
-    return bool(taken.delay) and other.behind(this, rows) < search.PLATEAU
+    if other.behind(this, models.effective(this.left)) >= search.PLATEAU:
+        return 0, 0.0
+    return taken.delay, samples.units.v_size * abs(other.gap - this.gap)
 
 
 def _still(best: Model) -> Model:

@@ -167,6 +167,13 @@ class Observed:
         """The best many plays in parallel."""
         return self.best(_many, PARALLEL)
 
+    def share(self, other: Candidate) -> float:
+        """Of what no G with a play explains, noise aside, what `other` does, at most 1."""
+        # The family holds not every G: no play explains less than the fit does.
+        left = float(np.sum(self.residual[self.family.rows]**2))
+        one = self.one_play._replace(squares=min(left, self.one_play.squares))
+        return min(self.family.share(other, one, self.noise), 1.0)
+
     def best(self, nonlinearity: Callable[..., Array], starts: Sequence[At]) -> Candidate:
         """The best of this nonlinearity from these starts, which is looked for once."""
         if nonlinearity not in self._candidates:

@@ -57,7 +57,8 @@ class Findings(NamedTuple):
     apart: deviation of the gap by other structures. gain: of y over v where y moves. gain_std,
     response_std: relative deviations of the gain at rest, and of G where y moves. evidence:
     log-likelihood by which the fit beats a u that stands still. rivals: other gaps, and by how much
-    they fall behind. open_delay: the longest that was compared, where a longer one fits as well.
+    they fall behind. open_delay: the longest that was compared, where a longer one fits as well;
+    by_delay: by how much one sample more then moves the gap.
     """
 
     observed: Observed
@@ -70,6 +71,7 @@ class Findings(NamedTuple):
     evidence: float
     rivals: Sequence[tuple[float, float]]
     open_delay: int
+    by_delay: float
 
     @property
     def gap(self) -> float:
@@ -128,9 +130,7 @@ def _doubts(f: Findings) -> Iterator[Doubt]:
                 f'{f.unexplained * abs(f.gain):.2g}', 'see the residual on the page: friction, a '
                 'load that moves by itself, or a higher order with --order')
     yield Doubt(f.apart, 'other orders or delays fit nearly as well, with another gap', SEVERAL)
-    # A delay that is too short by a sample looks like a gap that is wider by its motion of v.
-    yield Doubt(bool(f.open_delay) * float(np.abs(np.diff(o.v)).mean()),
-                'the delay may be a longer one', 'compare longer ones with --delay')
+    yield Doubt(f.by_delay, 'the delay may be a longer one', 'compare longer ones with --delay')
     if o.unexplained:
         gap = abs(o.one_play.at[0]) * o.family.swing
         squares, rows = o.one_play.squares / len(o.family.rows), effective(o.residual)
@@ -141,9 +141,9 @@ def _doubts(f: Findings) -> Iterator[Doubt]:
                     f'with another linear G it would be {gap:.3g}', SEVERAL)
         # Widths that are spread evenly have a deviation of their own.
         widest = abs(o.plays.at[0]) * o.family.swing
-        share = min(o.family.share(o.plays, o.one_play, o.noise), 1.0)
-        yield Doubt(share * widest / 12.0**0.5, f'many plays in parallel, up to {widest:.3g} '
-                    'wide, explain y better', 'only a single backlash is compensated here')
+        yield Doubt(o.share(o.plays) * widest / 12.0**0.5,
+                    f'many plays in parallel, up to {widest:.3g} wide, explain y better',
+                    'only a single backlash is compensated here')
 
 
 def _coasts(f: Findings) -> Iterator[Doubt]:
@@ -155,9 +155,8 @@ def _coasts(f: Findings) -> Iterator[Doubt]:
             (start, *brakes) for start in (0.01, 0.03, 0.1, 0.3, 1.3 * o.one_play.at[0])
             for brakes in ((0.0, 0.0), (3e-4, 0.0), (3e-3, 0.0), (0.0, 0.03), (0.0, 0.2))], 100)
         gap = abs(best.at[0]) * o.family.swing
-        share = min(o.family.share(best, o.one_play, o.noise), 1.0)
-        yield Doubt(share * abs(gap - f.gap), 'the load coasts while v crosses the gap, which '
-                    f'would be {gap:.3g} with that', 'brake it, or move more slowly')
+        yield Doubt(o.share(best) * abs(gap - f.gap), 'the load coasts while v crosses the gap, '
+                    f'which would be {gap:.3g} with that', 'brake it, or move more slowly')
 
 
 def _changes(f: Findings) -> Iterator[Doubt]:

@@ -157,3 +157,13 @@ def test_a_gap_on_a_part_of_the_way_is_told_though_none_fits_best() -> None:
     gaps, _ = family.changing(0.0, np.array([
         np.interp(V, np.linspace(V.min(), V.max(), 5), row) for row in np.eye(5)]))
     assert (gaps.argmax(), gaps[2]) == (2, pytest.approx(0.4, abs=0.1))
+
+
+def test_nothing_is_left_to_another_where_a_g_that_the_family_does_not_hold_explains_y() -> None:
+    p = play(V, GAP)
+    rings = lfilter([0.0, 1e-3], np.poly([0.98 + 0.1j, 0.98 - 0.1j, 0.95 + 0.25j, 0.95 - 0.25j]), p)
+    y = rings + NOISE * np.random.default_rng(5).standard_normal(len(V))
+    o = not_play.Observed(V, y, p, rings, NOISE / 1.2, GAP)
+    half = o.one_play._replace(squares=0.5 * o.one_play.squares)
+    assert o.family.share(half, o.one_play, o.noise) > 0.45
+    assert o.share(half) == 0.0

@@ -16,7 +16,7 @@ WANDER = 0.0155 * lfilter([1.0], [1.0, -0.95], np.random.default_rng(8).standard
 SAW = 0.02 * np.abs(np.arange(3000) % 400 - 200.0)
 FOUND = Findings(
     GOOD, gap_std=0.01, apart=0.0, c_r_std=0.01, gain=0.8, gain_std=0.01, response_std=0.02,
-    evidence=1e3, rivals=(), open_delay=0,
+    evidence=1e3, rivals=(), open_delay=0, by_delay=0.0,
 )
 
 
@@ -56,6 +56,7 @@ def test_what_would_mislead_a_controller_is_refused(changed: dict[str, Any], sai
      'went past the gap and back 2 times'),
     ({'rivals': [(0.9, 2.0)]}, 'two gaps fit alike, 0.6 and 0.9'),
     ({'apart': 0.18}, 'other orders or delays fit nearly as well'),
+    ({'by_delay': 0.18}, 'the delay may be a longer one'),
     ({'gap_std': 0.18}, 'y has a noise of 0.002, and the gap moves it by 0.48'),
     ({'gap_std': 0.18, 'observed': replace(GOOD, y=0.5 * np.round(GOOD.y / 0.5), noise=0.15)},
      'quantised in steps of 0.5'),
