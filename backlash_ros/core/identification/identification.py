@@ -136,16 +136,19 @@ def identify(
         one.whole for one in s.compared if one.whole.behind(best, rows) <= search.PLATEAU
         and one.structure != best.structure == replace(
             one.structure, delay=best.structure.delay)])
-    if len(v) > len(samples.v):
+    longer = len(v) > len(samples.v)
+    if longer:
         whole = y.copy()
         whole[part] = samples.y
         samples = replace(samples, v=v, y=whole, last=len(v))
         begin = best.begin(p0=float(v[0]) + 0.5 * best.gap)
         best = fitted(samples, best.structure, begin, steps=FIRST_STEPS)
-        kept = search.without_outliers(samples, best)
-        if kept is not samples:
-            samples = kept
-            best = fitted(samples, best.structure, best.fit)
+    # What the first model could not explain may be no outlier by the best one.
+    kept = search.without_outliers(replace(samples, y=y), best)
+    if not np.array_equal(kept.y, samples.y, equal_nan=True):
+        samples = kept
+        best = models.least_response(fitted(samples, best.structure, best.fit))
+    elif longer:
         best = models.least_response(best)
     s = s._replace(samples=samples, best=best, held_out=s.held_out._replace(
         first=part.start + s.held_out.first))

@@ -176,8 +176,7 @@ def without_outliers(samples: Samples, found: Model) -> Samples:
     same = np.append(False, np.diff(y) == 0.0)
     alone = same & ~np.append(False, same[:-1]) & ~np.append(same[1:], False)
     moves = np.abs(np.diff(simulated, prepend=simulated[0]))
-    wild = outliers(found.problem.residual(found.fit), step) \
-        | alone & (moves > max(step, 0.5 * found.rms))
+    wild = outliers(y - simulated, step) | alone & (moves > max(step, 0.5 * found.rms))
     if not wild.any():
         return samples
     y = samples.y.copy()
