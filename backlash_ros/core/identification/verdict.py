@@ -175,7 +175,8 @@ def _changes(f: Findings) -> Iterator[Doubt]:
         hats = np.array([np.interp(over, at, row) for row in np.eye(knots)])
         gaps, other = family.changing(f.gap, hats)
         if np.ptp(gaps) > 0.1 * f.gap and family.share(other, one, o.noise) >= half:
-            along = gaps @ hats
+            # Each place counts alike, however long v was there.
+            along = np.interp(np.linspace(at[0], at[-1], 100), at, gaps)
             yield Doubt(float(np.sqrt(np.mean((along - f.gap) ** 2))),
                         f'the gap changes {what}, {along.mean():.3g} in the mean: '
                         + ', '.join(f'{gap:.3g}' for gap in gaps), cure)
