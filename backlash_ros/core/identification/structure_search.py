@@ -29,7 +29,7 @@ from backlash_ros.core.identification.model import (
     first_model,
     fitted,
 )
-from backlash_ros.core.identification.not_play import Observed, what_it_is
+from backlash_ros.core.identification.not_play import Observed, best_other
 from backlash_ros.core.identification.verdict import ANOTHER
 from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.records.readings import noise_of, outliers, quantum
@@ -288,8 +288,10 @@ def later(early: StructureSearch, options: Options, progress: Progress) -> Struc
     latest = min(LONGEST_DELAY, len(early.samples.v) // 20)
     while (last := max(early.delays)) < latest and last in equal_delays(
             early.compared, early.chosen):
-        # What no G with a backlash explains, any delay explains a little better.
-        if what_it_is(observed_of(samples := early.samples, early.best)):
+        # What is no play, any delay explains a little better; what y does beside v is told by a
+        # residual, in which too short a delay shows as well.
+        o = observed_of(samples := early.samples, early.best)
+        if o.unexplained and best_other(o):
             break
         progress('searching later delays')
         late = searched(samples.v, samples.y, samples.units, options,
