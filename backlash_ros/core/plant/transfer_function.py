@@ -134,7 +134,8 @@ def check_model(model: TransferFunction) -> None:
             raise ParameterError(
                 'plant.denominator', model.denominator.tolist(),
                 f'has the unstable pole {_text(pole)}',
-                'close a stabilising loop around the plant first and give its G(z)',
+                'turn it around if its powers of z ascend, else close a stabilising loop around '
+                'the plant first and give its G(z)',
             )
     for zero in np.roots(model.numerator):
         near = poles[np.abs(poles - zero) < ON_CIRCLE]

@@ -139,7 +139,7 @@ def reasons(v: Array, y: Array, options: Options = QUICK) -> str:
 
 
 @pytest.mark.parametrize(('v', 'y', 'said'), [
-    (np.zeros(0), np.zeros(0), 'too few'), (np.zeros(3), np.zeros(3), 'too few'),
+    (np.zeros(0), np.zeros(0), 'too few'), (np.zeros(3), np.zeros(3), '3 samples of y are too'),
     (np.zeros(900), np.ones(900), 'v stood still'),
     (np.arange(900) % 100 / 10.0, np.ones(900), 'y stood still'),
     (np.arange(900) % 100 / 10.0, np.full(900, np.nan), 'too few'),

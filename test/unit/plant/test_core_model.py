@@ -44,7 +44,7 @@ def plant(numerator: list[float], denominator: list[float], **more: object) -> P
 
 
 @pytest.mark.parametrize(('numerator', 'denominator', 'reason'), [
-    ([1.0], [1.0, -1.2], 'unstable pole 1.2'),
+    ([1.0], [1.0, -1.2], 'unstable pole 1.2: turn it around if its powers of z ascend'),
     ([1.0, -1.0], [1.0, -0.5, 0.06], 'zero at z = 1'),
     ([1.0, -1.0], [1.0, -1.5, 0.5], 'cancels the pole 1'),
 ])
