@@ -50,14 +50,12 @@ class MessageLog:
 
     def __init__(self, path: str | None) -> None:
         self.heard = driver_check.Heard()
-        self._file = open(path or os.devnull, 'w', encoding='ascii')  # noqa: SIM115
+        # A line at a time, for `identify` reads it meanwhile.
+        self._file = open(path or os.devnull, 'w', 1, encoding='ascii')  # noqa: SIM115
 
     def note(self, topic: str, message: driver_check.Message) -> None:
         self.heard.by_topic[topic].append(message)
         print(topic, message.stamp_ns, repr(message.value), sep=',', file=self._file)
-
-    def flush(self) -> None:
-        self._file.flush()
 
 
 class ActuatorDrive:
@@ -79,11 +77,6 @@ class ActuatorDrive:
         self._newest_at = inf  # the newest y came
         self._answers = False
         self.ended = self.rivals = ''
-
-    @property
-    def moved(self) -> bool:
-        """Whether v was moved at all."""
-        return self._motion is not None
 
     @property
     def over(self) -> bool:
@@ -214,7 +207,6 @@ class CheckDriverNode(ProcessNode):
         """Take note of who is there."""
         self._graph = max(graph_around(self), self._graph,
                           key=lambda graph: (graph.publishers, graph.listeners))
-        self._messages.flush()
         if self._drive is not None:
             self._drive.look()
 
@@ -241,7 +233,7 @@ class CheckDriverNode(ProcessNode):
         if options.messages:
             if ended:
                 say(self, f'{ended}: drive ended')
-            if drive is not None and drive.moved:
+            if drive is not None and self._messages.heard.controls:
                 return DONE
             why = f'nobody subscribes to {control}' if self._messages.heard.outputs else \
                 f'nothing was heard on {self.resolve_topic_name(topics.PLANT_OUTPUT)}'

@@ -45,7 +45,7 @@ class Tracking(ControlStructure):
         noise_std: float = 0.0,
     ) -> None:
         self.delay = weights.preview
-        self._tuning = weights, shrinkage, noise_std
+        self._weights = weights
         self.trajectory = IdealTrajectory(beginning)
         self.feedback = StateFeedback(beginning, shrinkage, noise_std)
         self.rest, self.hand_over = Rest(), HandOver()
@@ -77,15 +77,15 @@ class Tracking(ControlStructure):
         self.hand_over = HandOver(due=self.trajectory.u, widens=True, leading=True)
 
     def retune(self, p: Parameters, source: StateSource) -> None:
-        tuning = weights, shrinkage, noise_std = (
+        feedback, tuning = self.feedback, (
             p.tracking, p.inverse.caution, p.estimator.output_noise_std)
-        if tuning != self._tuning:
-            gains, self._tuning = design(self.trajectory.design.model, weights), tuning
-            self.feedback.shrinkage, self.feedback.y_std = shrinkage, noise_std
+        if tuning != (self._weights, feedback.shrinkage, feedback.y_std):
+            gains = design(self.trajectory.design.model, p.tracking)
+            self._weights, feedback.shrinkage, feedback.y_std = tuning
             self.adopt(gains, source)
 
     def redesign(self, model: StateModel) -> Callable[[], object | None]:
-        return partial(better_design, model, self._tuning[0], self.trajectory.design)
+        return partial(better_design, model, self._weights, self.trajectory.design)
 
     def adopt(self, gains: object, source: StateSource) -> None:
         """Go on with a design as if it had been in use for as long as references are kept."""
