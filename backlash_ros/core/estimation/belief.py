@@ -111,7 +111,8 @@ def shortened(
 
 def _aged(setup: Setup, fit: WindowFit, prior: Prior, samples: int) -> Prior:
     """What is left of a prior after so many samples of drift and walk."""
-    rows, values = prior.rows / sqrt(fit.inflation), prior.values / sqrt(fit.inflation)
+    discount = sqrt(fit.left.dispersion / fit.inflation)  # a dispersion counts once, in the end
+    rows, values = discount * prior.rows, discount * prior.values
     if setup.drift.any():
         try:
             cov = np.linalg.inv(rows.T @ rows)

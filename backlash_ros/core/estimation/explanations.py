@@ -98,10 +98,10 @@ def afresh(
     # Where v has not turned often enough for any gap, what is found is named, but not used.
     hopeless = record.turns(0.01 * swing, first) < setup.turns_needed
     candidates, least = 1 if hopeless else 3, 0.1  # gaps that are fitted, and their distance
-    fits: list[WindowFit] = []
-    # Once more around G as the best of the first gaps has it.
-    for _ in range(2 if family.count and like is None and not hopeless else 1):
-        found, null = search(family, record.v, record.y, setup.noise_std, setup.widest, xi)
+    fits, near = list[WindowFit](), 0.0
+    # Once more around G as the best of the first gaps has it, and closely around that gap.
+    for _ in range(1 if hopeless else 2):
+        found, null = search(family, record.v, record.y, setup.noise_std, setup.widest, xi, near)
         if not found or (not fits and found[0].evidence < null + settings.ENGAGED):
             break
         gaps: list[float] = []
@@ -113,7 +113,8 @@ def afresh(
                 begin = WindowFit(np.zeros(1), p0, theta, noise, walk_std=setup.walk_std)
                 fits.append(p.finished(p.fitted(
                     p.step(begin, 1.0, held=True, begun=True), FIRST_STEPS)))
-        xi = max(fits, key=lambda f: f.evidence).theta[3:]
+        best = max(fits, key=lambda f: f.evidence)
+        xi, near, least = best.theta[3:], best.gap, 0.01
     if fits and also is not None and also.m > 0.0:
         begin = replace(also.without_intervals, x=np.zeros(1), knots=np.zeros(0),
                         walk_std=setup.walk_std)
@@ -124,8 +125,8 @@ def afresh(
             different.append(f)
     if not different:
         return None
-    near = different[0].evidence - settings.FAR_BEHIND
-    fits = [p.finished(p.fitted(f)) if f.evidence > near else f for f in different]
+    likely = different[0].evidence - settings.FAR_BEHIND
+    fits = [p.finished(p.fitted(f)) if f.evidence > likely else f for f in different]
     best = max(fits, key=lambda f: f.evidence)
     if best.m < 0.0 or hopeless:
         return best
@@ -164,12 +165,12 @@ def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]
     weights, std = p.at(best).weights, sqrt(best.cov[2, 2])
     likeliest, widest = p.log_posterior(best, weights), 2.0 * float(np.ptp(p.v))
     for away in (-3.0, 3.0):
-        wider, nearer, beside = np.zeros((3, 3)), 0.0, None
+        wider, nearer, beside, there = np.zeros((3, 3)), 0.0, None, best
         for reach in away * 3.0 ** np.arange(6.0):
-            theta = best.theta + best.cov[:, 2] * reach / std
-            if not 0.0 < theta[2] < widest:
+            gap = best.gap + reach * std
+            if not 0.0 < gap < widest:
                 break
-            value, there = _with_gap(p, best, theta, weights)
+            value, there = _with_gap(p, there, gap, weights)
             behind = max(likeliest - value, 1.0)
             if nearer <= 2.0:  # the furthest that is likely may lie well before this one
                 more = max(0.5 / behind - reach**-2, 0.0) * apart(there, best)
@@ -186,13 +187,14 @@ def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]
     return out, beyond
 
 
-def _with_gap(p: Problem, best: WindowFit, theta: Array, weights: Array) -> tuple[float, WindowFit]:
-    """The log-posterior and the likeliest fit with the gap of this theta, from where play began."""
-    v, found = float(p.v[0]), [(-inf, best)]
+def _with_gap(p: Problem, near: WindowFit, gap: float, weights: Array) -> tuple[float, WindowFit]:
+    """The log-posterior and the likeliest fit with this gap, from one with a gap near it."""
+    v, found, theta = float(p.v[0]), [(-inf, near)], near.theta.copy()
+    theta[2] = gap
     # The beginning may bar the way to another gap: from both of its ends as well, if it is open.
     ends = [(0.0, True), (1.0, True)] * isnan(p.older.v)
-    for share, begun in [((best.p0 - v) / best.gap, False), *ends]:
-        f = replace(best, p0=v + share * float(theta[2]), theta=theta)
+    for share, begun in [((near.p0 - v) / near.gap, False), *ends]:
+        f = replace(near, p0=v + share * gap, theta=theta)
         with suppress(np.linalg.LinAlgError):  # so far away that y is no number
             for _ in range(FEW_STEPS):
                 f = p.step(f, held=True, begun=begun)

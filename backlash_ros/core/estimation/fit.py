@@ -68,8 +68,9 @@ class Problem:
             b, a = self.family.at(f.xi)
             y = lfilter(b, a, u, padded(f.x, len(a) - 1))
             error = (self.y - y) * self.known
-            run = Run(b, a, p, u, y, error, posterior.likelihood(error, f.noise_std, f.step),
-                      *posterior.independence(self.y, self.known, y, self.step_of_readings))
+            weights, begins = posterior.independence(self.y, self.known, y, self.step_of_readings)
+            told = posterior.likelihood(error, f.noise_std, f.step, weights)
+            run = Run(b, a, p, u, y, error, told, weights, begins)
             self._newest = dict([(f, run), *self._newest.items()][:3])
         return self._newest[f]
 
@@ -268,17 +269,17 @@ class Problem:
         run, known = self.at(f), self.known
         w, count = run.weights, float(len(run.begins))
         density, score, information = run.likelihood
-        whole = score * w / sqrt(float(information[known].mean()))
-        e = np.add.reduceat(whole[known], run.begins)  # of what counts as one reading
+        e = np.add.reduceat((score * w)[known], run.begins)  # of what counts as one reading
         squares = max(float(e @ e), 1e-300)
         rho = max(float(e[lag:] @ e[:-lag]) / squares for lag in (1, 2, 4, 8) if lag < len(e))
-        rho = max(0.0, rho - 3.0 / sqrt(max(count, 1.0)))
-        rho *= min(1.0, squares / max(count, 1.0))  # below the noise there may be anything
+        dispersion = squares / max(float(w @ information), 1e-300)  # below 1 rho may be anything
+        rho = max(rho - 3.0 / sqrt(max(count, 1.0)), 0.0) * min(dispersion, 1.0)
         # In such units that a reading more or less makes no fit the likelier one.
         value = float(w @ density) + float(w.sum()) * log(self.step_of_readings or self.nominal)
         turns = len(reversals(engaged(self.v, run.p, max(f.gap, 0.0))))
         rms = sqrt(float(run.error @ run.error) / max(int(known.sum()), 1))
-        return replace(f, left=posterior.Left(value, rms, rho, count, turns))
+        return replace(f, left=posterior.Left(
+            value, rms, rho, dispersion if f.step else 1.0, count, turns))
 
     def begun(self, f: WindowFit, offset: bool = False) -> WindowFit:
         """The same with the state before the record, and o where `offset`, at their best."""

@@ -11,7 +11,6 @@ System Identification with Quantized Observations, Birkhaeuser 2010):
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from math import inf, log, nan, pi, sqrt
 from typing import NamedTuple
 
@@ -44,16 +43,18 @@ def step_of(y: Array) -> float:
     return float(apart.min()) if abs(steps - np.round(steps)).max() < even else 0.0
 
 
-def likelihood(r: Array, noise_std: float, step: float) -> Likelihood:
-    """What readings say of outputs that they are off from by r (N,); step 0: none."""
+def likelihood(r: Array, noise_std: float, step: float, weights: Array) -> Likelihood:
+    """What readings, weighted (N,), say of outputs that they are off from by r (N,)."""
     if not step:
         return Likelihood(
             -0.5 * (r / noise_std) ** 2 - log(sqrt(2.0 * pi) * noise_std), r / noise_std**2,
             np.full(len(r), noise_std**-2))
     half = 0.5 * step / noise_std
     probability, score, curvature = _of_interval(r / noise_std, half)
-    # Readings deep within their interval say nothing, and would leave unknowns open.
-    information = np.clip(curvature, mean_information(round(half, 6)), 1.0)
+    # What says nothing, deep within its interval, would leave unknowns open. Their sum stays.
+    mean = (weights @ curvature + 1e-9) / (weights.sum() + 1e-9)
+    information = np.maximum(curvature, mean)
+    information *= (weights @ curvature + 1e-9) / (weights @ information + 1e-9)
     return Likelihood(probability - log(step), score / noise_std, information / noise_std**2)
 
 
@@ -68,14 +69,6 @@ def _of_interval(r: Array, half: float) -> tuple[Array, Array, Array]:
         np.exp(-0.5 * edge**2 - probability) / sqrt(2.0 * pi) for edge in (upper, lower))
     score = at_lower - at_upper
     return probability, score, score**2 + upper * at_upper - lower * at_lower
-
-
-@lru_cache(maxsize=256)
-def mean_information(half: float) -> float:
-    """Fisher's information of a reading, averaged over its step of 2 half [noise]."""
-    r = np.asarray(np.linspace(-half - 8.0, half + 8.0, 2001), np.float64)
-    probability, score, _ = _of_interval(r, half)
-    return float(score**2 @ np.exp(probability) * (r[1] - r[0]) / (2.0 * half))
 
 
 def independence(
@@ -110,6 +103,7 @@ class Left(NamedTuple):
     likelihood: float = -inf  # log
     rms: float = inf
     correlation: float = 0.0
+    dispersion: float = 1.0  # mean square of the scores of intervals, over their information
     readings: float = 0.0  # independent ones
     turns: int = 0  # reversals
 
@@ -151,7 +145,7 @@ class WindowFit:
     @property
     def inflation(self) -> float:
         """Of the covariance: N correlated residuals are N / (1 - rho + N rho) independent ones."""
-        return 1.0 - self.left.correlation + self.left.readings * self.left.correlation
+        return self.left.dispersion + (self.left.readings - 1.0) * self.left.correlation
 
     @property
     def cov_xi(self) -> Array:

@@ -176,21 +176,21 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
     if record.end >= look_at or (fit.gap_std < look_below and count <= SHORT_RECORD):
         fit = problem.with_intervals(fit)
         if count <= SHORT_RECORD and isnan(problem.older.v):
-            other = afresh(setup, record, None if kept.older is None else fit, kept.older)
-            known = other is not None and setup.is_known(other, settings.REVERSALS)
-            fit = mixed(problem, fit, [other] if other is not None and known else [])
+            other = afresh(setup, record, None if kept.older is None else fit, kept.older, fit)
+            found = other and setup.is_known(other, settings.REVERSALS)
+            fit = other if other and found else mixed(problem, fit)
             record, fit, swapped = weighed(setup, record, fit, kept.swapped, kept.older)
             if swapped != kept.swapped:
                 problem = setup.problem(record, kept.older)
                 after = after._replace(kept=kept._replace(swapped=swapped))
-        elif fit.spread.any():  # else it has been normal for long
+        elif fit.step or fit.spread.any():  # else it has been normal for long
             fit = mixed(problem, fit)
         fit = with_walk(problem, fit, setup.walk_std)
         after = after._replace(thorough=(record.end + 2 * count // 5, 0.5 * fit.gap_std))
-        if not fit.alike(held):  # nothing contradicted what was held: let the next samples decide
-            after = after._replace(trial=Trial(PREDICTED, 0, fit.noise), reason=Status.ACQUIRING)
     else:
         fit = problem.finished(fit)
+    if not fit.alike(held):  # nothing contradicted what was held: let the next samples decide
+        after = after._replace(trial=Trial(PREDICTED, 0, fit.noise), reason=Status.ACQUIRING)
     after = after._replace(coasts=coasts(problem, fit))
     return _published(setup, *shortened(setup, record, problem, after, fit))
 
@@ -269,7 +269,7 @@ def _published(setup: Setup, belief: Belief, fit: WindowFit) -> Belief:
     belief, known = belief._replace(fit=fit), belief.inherited
     if known is not None:
         return _beside_inherited(setup, belief, fit, known)
-    if not setup.is_known(fit, settings.REVERSALS):
+    if not setup.is_known(fit, settings.REVERSALS if belief.kept.older is not None else None):
         return belief._replace(reason=Status.INCONSISTENT)
     if belief.trial.predicted < belief.trial.must:
         return belief

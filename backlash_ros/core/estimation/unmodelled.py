@@ -59,9 +59,8 @@ def _runs_on(problem: Problem, fit: WindowFit) -> float:
 
 def with_walk(problem: Problem, f: WindowFit, least: float) -> WindowFit:
     """The fit, or one with a larger walk of u if that explains correlated residuals."""
-    best, begin = f, replace(f.without_intervals, knots=np.zeros(0), walk_std=least)
-    if f.walk_std != least:
-        best = problem.with_intervals(problem.fitted(begin))
+    begin = replace(f.without_intervals, knots=np.zeros(0), walk_std=least)
+    best = f if f.walk_std == least else problem.with_intervals(problem.fitted(begin))
     if not best.valid or not best.systematic:
         return best
     runs_on = _runs_on(problem, best) > settings.BY_CHANCE

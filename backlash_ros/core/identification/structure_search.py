@@ -154,7 +154,7 @@ def _of_gaps(samples: Samples, like: Model) -> list[Model]:
     structure, problem = like.structure, like.problem
     y = np.where(problem.known, problem.y, nan)
     hypotheses, _ = search(structure, problem.v, y, 1e-12, 0.98 * float(np.ptp(problem.v)),
-                           like.fit.theta[3:], smallest)
+                           like.fit.theta[3:], smallest=smallest)
     begins, gaps = [like.fit], [like.gap]
     for _, gap, p0, _ in hypotheses:
         if len(begins) <= most and all(abs(gap - other) > ANOTHER * other for other in gaps):

@@ -12,7 +12,7 @@ from backlash_ros.core.estimation.explanations import Setup, afresh
 from backlash_ros.core.estimation.late_commands import weighed
 from backlash_ros.core.estimation.observer import RATIOS, gain_of
 from backlash_ros.core.estimation.plant_family import PlantFamily
-from backlash_ros.core.estimation.posterior import independence, likelihood, mean_information
+from backlash_ros.core.estimation.posterior import independence, likelihood
 from backlash_ros.core.estimation.search import search
 from backlash_ros.core.plant.backlash import play
 from backlash_ros.core.plant.numerics import lfilter
@@ -65,14 +65,14 @@ R = APART * np.arange(-12_000, 12_001)
 
 @pytest.mark.parametrize(('noise', 'step'), [(0.3, 0.0), (0.3, 1.0), (1.0, 1.0)])
 def test_density_slope_and_information_belong_together(noise: float, step: float) -> None:
-    found = likelihood(R, noise, step)
+    near = np.abs(R) < 4.0 * noise
+    found = likelihood(R, noise, step, near.astype(float))
     density = np.exp(found.log_density)
     assert density.sum() * APART == pytest.approx(1.0, rel=1e-6)
-    near = np.abs(R) < 4.0 * noise
     by_output = -np.gradient(found.log_density, R)
     assert found.score[near] == pytest.approx(by_output[near], abs=1e-3)
-    expected = (mean_information(0.5 * step / noise) if step else 1.0) / noise**2
-    assert (found.score**2 * density).sum() * APART == pytest.approx(expected, rel=1e-3)
+    curvature = np.gradient(found.score, R)[near].sum()
+    assert found.information[near].sum() == pytest.approx(curvature, rel=1e-3)
 
 
 def test_readings_that_repeat_one_rounding_count_as_one() -> None:
