@@ -11,6 +11,7 @@ good predictors; of these the least N' log(squares) + unknowns log(N') over all 
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from math import inf, log, nan, sqrt
 from typing import NamedTuple
 
@@ -189,24 +190,30 @@ def _compare(
 ) -> list[Compared]:
     """Fit the structures to the samples before `cut` and to all of them, from models whose gap and
     beginning are about right, and from those with a pole less."""
+    hopeless = 8.0  # times the squares of the best fit that a first part alone may leave
     train, later = replace(samples, last=cut), replace(samples, first=cut)
-    found: dict[Structure, tuple[Model, Model]] = {}
+    found: dict[Structure, Model] = {}
     for structure in sorted(structures, key=lambda s: s.order):
         begin = min(first_model(train, structure, like.gap, like.fit.p0) for like in candidates)
         smaller = found.get(replace(structure, order=structure.order - 1))
-        also = [smaller[0].begin_with_pole(0.6, structure)] if smaller else []
-        trained = fitted(train, structure, begin.fit, *also, steps=FIRST_STEPS)
-        found[structure] = trained, fitted(samples, structure, trained.fit)
-    best = min(whole for _, whole in found.values())
+        also = [smaller.begin_with_pole(0.6, structure)] if smaller else []
+        found[structure] = fitted(train, structure, begin.fit, *also, steps=FIRST_STEPS)
+    first = min(found.values())
+    best = fitted(samples, first.structure, first.fit)
+    whole = {structure: fitted(samples, structure, trained.fit)
+             if trained.squares < hopeless * best.squares
+             else Model(structure, samples.problem(structure), trained.fit)
+             for structure, trained in found.items()}
+    best = min(whole.values())
     count, rows = len(best.left), effective(best.left)
     compared = []
-    for structure, (trained, whole) in found.items():
+    for structure, trained in found.items():
         error = later.fitted_y - _predicted(trained, later)
         error = error[np.isfinite(later.fitted_y)]
         rms = float(np.sqrt(np.mean(error**2)))
         compared.append(Compared(
-            structure, max(rms, EXACT) if np.isfinite(rms) else inf, trained, whole,
-            rows * log(max(whole.squares, EXACT**2 * count))
+            structure, max(rms, EXACT) if np.isfinite(rms) else inf, trained, whole[structure],
+            rows * log(max(whole[structure].squares, EXACT**2 * count))
             + structure.unknowns * log(max(rows, 1.0)), 1.0 / sqrt(2.0 * effective(error))))
     return compared
 
@@ -255,6 +262,7 @@ def gives_way(found: Model, compared: Sequence[Compared]) -> bool:
                for one in compared)
 
 
+@lru_cache(64)  # of the structures that are compared
 def cancelled_poles(found: Model) -> list[complex]:
     """Poles that a zero all but cancels, so that neither shows; an integrator as exactly 1."""
     if not np.isfinite(found.numerator).all():

@@ -37,8 +37,7 @@ class Phase(Enum):
 class Driver(NamedTuple):
     """What a loop can ask about its driver: the clock of its stamps, who else tells of it.
 
-    applied: the name of its reports of v. warn: tells the user. steady_s: a clock nobody sets [s].
-    wall_ns: the clock of sending and receiving.
+    applied: its reports of v. warn: tells the user. steady_s: never set [s]. wall_ns: of messages.
     """
 
     now_ns: Callable[[], int]
@@ -63,8 +62,7 @@ class ControlLoop:
     """Answers outputs with commands, whatever the driver does.
 
     estimate: to begin with, None for what was known before. v: the command that acts; None, and
-    then taken for 0, as long as nobody knows (knows_v). executor: where fits are made, None for
-    here.
+    then taken for 0, as long as nobody knows (knows_v). executor: makes the fits, None: at once.
     """
 
     def __init__(
@@ -325,7 +323,7 @@ class ControlLoop:
 
 
 class JointLoops:
-    """Answers a message about all joints with one of commands for all; no loop knows another.
+    """Answers a message about all joints with one of commands for all.
 
     driver: what can be asked about that of a joint. before: estimates to begin with, of joints that
     do not begin with what was known before. by_name: in the order of `joints`; a single one may be
@@ -355,10 +353,10 @@ class JointLoops:
                y_m: float | None = None) -> dict[str, ControlStep]:
         """Send v(k) for y(k) of all joints that there are; returns the steps that were made."""
         arrival = self.counter.count(*next(iter(outputs.values())).counted)
-        if self._together and any(
+        lost = self._together and any(
             loop.silent and not (joint in outputs and isfinite(outputs[joint].y))
-            for joint, loop in self.by_name.items()
-        ):
+            for joint, loop in self.by_name.items())
+        if lost:
             outputs = {}  # an arm of which one joint is still lost does not begin
         steps = {}
         for joint, loop in self.by_name.items():

@@ -202,11 +202,7 @@ def test_after_the_swap_y_follows_as_if_the_true_model_had_been_told(name: str) 
     assert swapped.structure.delay == ideal.structure.delay
 
 
-def rest_after(k: int) -> float:
-    return multisine(min(k, 560))
-
-
-@pytest.mark.parametrize('reference', [multisine, rest_after])
+@pytest.mark.parametrize('reference', [multisine, lambda k: multisine(min(k, 560))])
 @pytest.mark.parametrize('name', [name for name in TRUE if name != 'late'])
 @pytest.mark.parametrize('after', [601, 712])
 def test_no_move_at_a_swap_is_larger_than_the_largest_of_the_second_before(name, after, reference):

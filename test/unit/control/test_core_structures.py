@@ -101,16 +101,12 @@ def test_loop_without_backlash_answers_as_the_reference_model_says(filter_pole: 
         'estimator.initial.c_l': 0.0, 'backlash.c_r': 1e-12, 'backlash.c_l': -1e-12,
         'amplitude': 0.2})
     run = build_closed_loop(p).run(300)
-    blocks = place_poles(PAPER, closed_of(p), filter_pole)
+    blocks = place_poles(PAPER, build_four_blocks(p).reference.denominator, filter_pole)
     np.testing.assert_allclose(
         run.column('y'), answer(blocks.reference, run.column('y_m')), atol=1e-6)
     ramp = np.arange(400.0)
     late = ramp[-1] - answer(blocks.reference, ramp)[-1]
     assert build_structure(p).delay == round(late) > 0
-
-
-def closed_of(p: Parameters) -> np.ndarray:
-    return build_four_blocks(p).reference.denominator
 
 
 def test_common_factor_of_numerator_and_denominator_is_refused() -> None:

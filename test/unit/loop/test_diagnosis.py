@@ -124,10 +124,6 @@ def first(figures: LoopFigures) -> Finding:
     return findings_of(figures)[0]
 
 
-def worst_level(figures: LoopFigures) -> Level:
-    return max(finding.level for finding in findings_of(figures))
-
-
 def test_every_status_has_words_of_its_own() -> None:
     texts = [first(replace(WELL, status=status)).text for status in (None, *Status)]
     assert len(set(texts)) == len(Status) + 1
@@ -220,7 +216,8 @@ def test_a_rival_whose_name_is_not_known_yet_is_no_line_of_the_log_at_once() -> 
     {'output': output_from(DRIVER, OTHER)},
 ])
 def test_an_estimate_that_does_not_fit_stays_an_error_beside_other_causes(changes):
-    assert worst_level(replace(INCONSISTENT, **changes)) == Level.ERROR
+    found = findings_of(replace(INCONSISTENT, **changes))
+    assert max(finding.level for finding in found) == Level.ERROR
 
 
 @pytest.mark.parametrize(('hz', 'std', 'said'), [

@@ -111,12 +111,6 @@ def times(count: int, period_s: float = PERIOD_S) -> list[float]:
     return [0.5 * PERIOD_S + k * period_s for k in range(count)]
 
 
-def check_rate(sent: list[tuple[float, int]], end_s: float) -> None:
-    gaps = [later - earlier for (earlier, _), (later, _) in pairwise(sent)]
-    assert min(gaps) >= 0.5 * PERIOD_S - ROUNDING_S
-    assert len(sent) <= end_s / PERIOD_S + 2
-
-
 def test_reference_of_the_next_sample_leaves_half_a_period_after_each_output() -> None:
     arrivals = times(100)
     sent = messages_of(arrivals, 100 * PERIOD_S)[2:]
@@ -133,7 +127,9 @@ def test_there_is_never_more_than_a_message_per_period_nor_two_close_together(ga
         arrivals.append(at)
     end_s = at + 10 * PERIOD_S
     sent = messages_of(arrivals, end_s, sleeps)
-    check_rate(sent, end_s)
+    gaps = [later - earlier for (earlier, _), (later, _) in pairwise(sent)]
+    assert min(gaps) >= 0.5 * PERIOD_S - ROUNDING_S
+    assert len(sent) <= end_s / PERIOD_S + 2
     samples = [sample for _, sample in sent]
     begun = [sample for sample in samples if sample > 0]
     assert begun == sorted(set(begun))

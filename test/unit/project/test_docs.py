@@ -188,12 +188,8 @@ def blocks(*languages: str) -> list[str]:
         if language in languages]
 
 
-def python_snippets() -> list[str]:
-    return blocks('python') + [
-        snippet for text in blocks('bash', 'sh', 'ini') for snippet in PYTHON_C.findall(text)]
-
-
-@pytest.mark.parametrize('text', python_snippets())
+@pytest.mark.parametrize('text', blocks('python') + [
+    snippet for text in blocks('bash', 'sh', 'ini') for snippet in PYTHON_C.findall(text)])
 def test_python_of_the_pages_runs(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
     exec(text, {})

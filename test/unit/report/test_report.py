@@ -42,10 +42,6 @@ def page(run: RunRecord, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out / 'report.html'
 
 
-def png_references(html: str) -> list[bytes]:
-    return [base64.b64decode(data) for data in re.findall(r'base64,([^"]+)"', html)]
-
-
 def test_page_needs_nothing_from_elsewhere(page: Path) -> None:
     html = re.sub('base64,[^"]+', 'base64,', page.read_text(encoding='utf-8'))
     sources = re.findall(r'(?:src|href|url|srcset|action)\s*[=(]\s*["\']?([^"\'>\s)]+)', html)
@@ -57,7 +53,8 @@ def test_page_needs_nothing_from_elsewhere(page: Path) -> None:
 def test_page_holds_the_pictures_that_lie_beside_it(page: Path) -> None:
     html = page.read_text(encoding='utf-8')
     beside = {path.name: path.read_bytes() for path in page.parent.glob('*.png')}
-    assert sorted(png_references(html)) == sorted(beside.values())
+    shown = [base64.b64decode(data) for data in re.findall(r'base64,([^"]+)"', html)]
+    assert sorted(shown) == sorted(beside.values())
     assert set(beside) == {
         'parameter_errors.png', 'estimates.png', 'control_error.png', 'laws.png',
         'hysteresis.png', 'output.png', 'input.png'}
