@@ -19,6 +19,7 @@ import numpy as np
 
 from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.parameters import ParameterError
+from backlash_ros.core.plant.numerics import riccati
 from backlash_ros.core.plant.transfer_function import Array, StateModel, TransferFunction
 
 # Square of a signal below which it counts as none. Its inverse, times the square of any
@@ -79,12 +80,13 @@ class InputReconstruction:
 
     def _stationary(self, size: int) -> Array:
         """Covariance of z before a measurement when no sample was ever lost; size: of (x, u)."""
-        from scipy import linalg  # where it is needed: 31 MB
-
-        output, process = np.zeros((size, 1)), np.zeros((size, size))
-        output[0, 0], process[-1, -1] = self._c, 1.0
-        p = linalg.solve_discrete_are(
-            self._step[:size, :size].T, output, process, np.array([[self._noise]]))
+        unit, step = np.eye(size), self._step[:size, :size]
+        process, output = np.outer(unit[-1], unit[-1]), self._c * unit[0]
+        p = riccati(step.T, output / sqrt(self._noise), process)
+        for _ in range(100):  # filtering takes out what rounding has left there for little noise
+            gain = p @ output / (output @ p @ output + self._noise)
+            rest = unit - np.outer(gain, output)
+            p = step @ (rest @ p @ rest.T + self._noise * np.outer(gain, gain)) @ step.T + process
         as_if_resting = np.minimum(np.arange(size + self.lag), size - 1)
         covariance: Array = p[np.ix_(as_if_resting, as_if_resting)]
         for _ in range(self.lag):
