@@ -42,7 +42,7 @@ class InputReconstruction:
         if lag < model.delay:
             raise ParameterError(
                 'estimator.lag', lag, f'must be >= {model.delay}', 'G(z) delays u by as much')
-        self.lag, self.innovation, self.samples = lag, nan, 0
+        self.lag, self.samples = lag, 0
         state = StateModel(model)
         n = state.order
         # y is scaled so that a typical step of u, of size 1, shows in it with size 1: the median of
@@ -75,7 +75,7 @@ class InputReconstruction:
         self._steady = np.vstack([np.outer(gain, by_z), by_z])
         self._steady[:-1, :-1] += self._step
         self._steady_covariance, self.std = self._covariance, sqrt(variance)
-        self._z: Array = np.zeros(n + 2 + lag)  # given y(..k), and its innovation
+        self._z: Array = np.append(np.zeros(n + 1 + lag), nan)  # given y(..k), and its innovation
         self._since_loss = 4 * lag
 
     def _stationary(self, size: int) -> Array:
@@ -97,6 +97,10 @@ class InputReconstruction:
     @property
     def u_hat(self) -> float:
         return self._z.item(-2)
+
+    @property
+    def innovation(self) -> float:
+        return self._z.item(-1) * self._scale
 
     def newer(self, samples: int) -> float:
         """u_hat(k - lag + samples) given y(..k)."""
@@ -121,16 +125,14 @@ class InputReconstruction:
             self._covariance = self._steady_covariance
             self._z[-1] = y / self._scale
             self._z = self._steady @ self._z
-            self.innovation = self._z.item(-1) * self._scale
             return self.u_hat
         self._covariance = self._propagated(self._covariance)
-        z, self.innovation = self._step @ self._z[:-1], nan
+        z, e = self._step @ self._z[:-1], nan
         if y is not None:
             e = y / self._scale - self._c * z.item(0)
-            self.innovation = e * self._scale
             gain, self._covariance = self._corrected(self._covariance)
             z += gain * e
-        self._z = np.append(z, nan)
+        self._z = np.append(z, e)
         return self.u_hat
 
     def _corrected(self, p: Array) -> tuple[Array, Array]:

@@ -68,14 +68,15 @@ class Timing(NamedTuple):
 
 
 class DriverPeriod:
-    """Learns the period of a driver [s] from stamps [ns]; period_ns: to count with."""
+    """Learns the period of a driver [s] from stamps [ns]; period_ns: to count with. came_early:
+    whether a sample was counted that came before it was due."""
 
     def __init__(self, nominal_s: float) -> None:
         self.nominal_s, self.period_ns = nominal_s, 1e9 * nominal_s
         self._samples_ns: deque[int] = deque(maxlen=1000)
         self._messages_ns: deque[int] = deque(maxlen=51)
         self._ages_s: deque[float] = deque(maxlen=50)
-        self._since_learned = 0  # samples
+        self._since_learned, self.came_early = 0, False  # samples
 
     def hear(self, stamp_ns: int, received_ns: int) -> None:
         """Take in any message of y: when it left and when it came, 0 where nobody tells."""
@@ -91,7 +92,7 @@ class DriverPeriod:
         """Begin anew with this sample: the clock of the stamps is another one."""
         self._samples_ns.clear()
         self._samples_ns.append(stamp_ns)
-        self._since_learned, self.period_ns = 0, 1e9 * self.nominal_s
+        self._since_learned, self.came_early, self.period_ns = 0, False, 1e9 * self.nominal_s
 
     def learn(self) -> None:
         """Learn the period to count with, if it is time: for whenever nothing waits for it."""
@@ -221,7 +222,6 @@ class SampleCounter:
         self._lateness_ns: deque[float] = deque(maxlen=20)  # before any shift
         self._shifted_ns = 0.0  # by how much due_ns was shifted so far
         self._on_time = 0  # samples that came when they were due, less the early ones
-        self._early = False  # whether any came early
         self._strange = 0  # messages in a row that do not follow the newest sample
 
     def count(self, stamp_ns: int, sequence: int = UNNUMBERED, numbered: bool = True,
@@ -270,8 +270,8 @@ class SampleCounter:
         if missing == 0 and not keeps_time:
             # One that came early outweighs two that were due.
             self._on_time = max(self._on_time + (-2 if is_early else 1), 0)
-            self._early = self._early or is_early
-            if self._early and self._on_time == 20:
+            self.sender.came_early |= is_early
+            if self.sender.came_early and self._on_time == 20:
                 # It keeps time: those that came early were none, and the count until now is wrong.
                 arrival = self._of_another(stamp_ns, sequence, at_once=True)
                 self._on_time = 20
@@ -317,7 +317,7 @@ class SampleCounter:
         self._stamp_ns = stamp_ns
         self._lateness_ns.clear()
         self.sender.restart(stamp_ns)
-        self._on_time, self._early, self._strange = 0, False, 0
+        self._on_time = self._strange = 0
 
 
 def kept_outputs(sample_period: float) -> int:

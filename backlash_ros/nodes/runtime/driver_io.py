@@ -3,7 +3,7 @@
 import time
 from array import array
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache
+from functools import cache, cached_property
 from math import nan
 from typing import Any, NamedTuple
 
@@ -86,7 +86,7 @@ class DriverIo:
 
     The only joint of a controller without `joints` is nameless; io.joint is its name in messages.
     skipped: messages in a row without a joint. seen: the joints of the newest of these.
-    simulated_time: whether stamps are those of /clock. heard: subscriptions by topic.
+    heard: subscriptions by topic.
     """
 
     publisher: Publisher
@@ -94,8 +94,6 @@ class DriverIo:
     def __init__(self, node: ProcessNode, p: Parameters) -> None:
         self.topics = driver_topics(p)
         self.skipped, self.seen = dict.fromkeys(p.joint_names, 0), ''
-        # On simulated time the stamps of the middleware, which are real time, say nothing.
-        self.simulated_time = bool(node.get_parameter('use_sim_time').value)
         self._node, self._p = node, p
         self._stamp = 0, 0  # in the header of the newest y, and the number of its message
         self.clock = WallClock()
@@ -103,6 +101,11 @@ class DriverIo:
         self._newest: dict[str, float] = {}  # v by joint
         self._referred = JointMessage()  # the newest message of references
         self.heard: dict[str, Subscription] = {}
+
+    @cached_property
+    def simulated_time(self) -> bool:
+        """Whether stamps are those of /clock: the middleware has real time."""
+        return bool(self._node.get_parameter('use_sim_time').value)
 
     @property
     def is_simulated(self) -> bool:
