@@ -76,18 +76,19 @@ class Controller:
             loop.take_reference(y_m)
         if driver.tick < self.stalled_until:
             return
-        self._clock.look(driver.answered_ns, driver.answered_ns - driver.offset_ns)
-        set_ns = self._clock.set_ns
         for v, stamp_ns in driver.applied:
-            loop.take_applied(v, stamp_ns - set_ns)
+            loop.take_applied(v, stamp_ns - self._clock.of_stamps_ns)
         driver.applied.clear()
         outputs = driver.outputs[-kept_outputs(self.p.sample_period):]
         driver.outputs.clear()
         if not self.active:
             return
         for i, o in enumerate(outputs):
+            now_ns = driver.answered_ns
+            self._clock.look(now_ns, now_ns - driver.offset_ns, o.stamp_ns)
+            set_ns = self._clock.of_stamps_ns
             output = o._replace(stamp_ns=o.stamp_ns - set_ns, sent_ns=o.sent_ns - set_ns,
-                                received_ns=o.received_ns - set_ns)
+                                received_ns=o.received_ns - self._clock.set_ns)
             begins, core = loop.begins, loop.core
             step = loop.answer(output)
             if step is not None:

@@ -131,7 +131,7 @@ class DriverIo:
     def stamp_ns(self, info: dict[str, Any]) -> int:
         """When a message left."""
         return self.now_ns() if self.simulated_time \
-            else int(info['source_timestamp']) - self.clock.set_ns
+            else int(info['source_timestamp']) - self.clock.of_stamps_ns
 
     def known_of(self, timing: Timing) -> Timing:
         # Those of simulated time have nothing to do with the time of arrival.
@@ -145,7 +145,6 @@ class DriverIo:
         def hear_output(
             values: dict[str, float], info: dict[str, Any], message: float | JointMessage,
         ) -> None:
-            self.clock.look_now()
             stamp_ns, number = 0, info['publication_sequence_number']
             of_joints = isinstance(message, JointMessage)
             if isinstance(message, JointMessage):
@@ -162,10 +161,12 @@ class DriverIo:
                         or self._node.count_publishers(self.topics.output) == 1
                 stamp_ns = 0 if self._repeats_stamps else message.stamp_ns
             # Drivers that leave the header empty are known by the stamp of the middleware.
-            set_ns = self.clock.set_ns
-            known = (stamp_ns - set_ns if stamp_ns else self.stamp_ns(info),
-                     info['source_timestamp'] - set_ns, info['received_timestamp'] - set_ns,
-                     number, not of_joints)
+            if not self.simulated_time:
+                self.clock.look_now(stamp_ns or info['source_timestamp'])
+            of_stamps_ns = self.clock.of_stamps_ns
+            known = (stamp_ns - of_stamps_ns if stamp_ns else self.stamp_ns(info),
+                     info['source_timestamp'] - of_stamps_ns,
+                     info['received_timestamp'] - self.clock.set_ns, number, not of_joints)
             hear({joint: Output(y, *known) for joint, y in values.items()})
 
         return self.listen_to(self.topics.output, hear_output, output_qos(self._p, depth), polled)

@@ -155,20 +155,21 @@ def test_the_first_command_goes_on_from_what_is_known_of_v(reports, initial):
     assert np.abs(np.diff([STANDING, *world.sent])).max() <= STEP
 
 
-@pytest.mark.parametrize(('jump_s', 'own', 'interruptions', 'lost'), [
-    *((jump_s, True, 0, 0) for jump_s in (3600.0, 0.1, 0.004, -0.004, -0.2)),
-    (0.21, False, 1, 21), (-0.2, False, 1, 0), (0.1, False, 0, 10),
+@pytest.mark.parametrize(('jump_s', 'own', 'its', 'interruptions', 'lost'), [
+    *((jump_s, True, True, 0, 0) for jump_s in (3600.0, 0.1, 0.004, -0.004, -0.2)),
+    *((jump_s, True, False, 0, 0) for jump_s in (0.21, -0.2)),
+    (0.21, False, True, 1, 21), (-0.2, False, True, 1, 0), (0.1, False, True, 0, 10),
 ])
 def test_a_clock_that_is_set_counts_only_where_it_is_that_of_another_machine(
-    jump_s: float, own: bool, interruptions: int, lost: int,
+    jump_s: float, own: bool, its: bool, interruptions: int, lost: int,
 ) -> None:
     world = SimulatedLoop(**{'estimator.law': 'fixed', 'timeout.plant_output': 0.2})
     world.run(100)
     jump_ns = round(jump_s * 1e9)
-    if own:
-        world.driver.offset_ns += jump_ns
-    else:
-        world.fault = lambda k, output: [output._replace(stamp_ns=output.stamp_ns + jump_ns)]
+    world.driver.offset_ns += jump_ns * own
+    if own is not its:
+        off_ns = jump_ns * (its - own)
+        world.fault = lambda k, output: [output._replace(stamp_ns=output.stamp_ns + off_ns)]
     world.run(100)
     statistics = world.loop.statistics
     assert (statistics.interruptions, statistics.lost) == (interruptions, lost)
