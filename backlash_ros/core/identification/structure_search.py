@@ -201,13 +201,11 @@ def _compare(
     first = min(found.values())
     best = fitted(samples, first.structure, first.fit)
     whole = {structure: fitted(samples, structure, trained.fit)
-             if trained.squares < hopeless * best.squares
-             else Model(structure, samples.problem(structure), trained.fit)
-             for structure, trained in found.items()}
+             for structure, trained in found.items() if trained.squares < hopeless * best.squares}
     best = min(whole.values())
     count, rows = len(best.left), effective(best.left)
     compared = []
-    for structure, trained in found.items():
+    for structure, trained in ((one, found[one]) for one in whole):
         error = later.fitted_y - _predicted(trained, later)
         error = error[np.isfinite(later.fitted_y)]
         rms = float(np.sqrt(np.mean(error**2)))

@@ -180,7 +180,9 @@ def test_samples_that_contradict_in_a_row_are_none_of_them_lost(seed: int) -> No
     for name in NAMES:
         off = np.abs(record.column(name) - record.column(f'true_{name}'))
         assert np.all(off[tracking] <= 5.0 * record.column(f'std_{name}')[tracking])
-    assert np.count_nonzero(tracking) > 190
+    first = int(np.argmax(tracking))
+    assert 0 < first < 150
+    assert tracking[first:].all()  # the leak, once learned, is no contradiction any more
 
 
 @pytest.mark.parametrize('disturbance', [2.0, -1.0])
