@@ -56,7 +56,8 @@ class Recorder:
 
     def __init__(self, capacity: int) -> None:
         self.end, self._capacity = 0, capacity
-        self._kept = Window(0, *np.empty((3, 2 * capacity)))
+        # Each on its own: of 4 MB and more NumPy asks for huge pages, and one sample takes them.
+        self._kept = Window(0, *(np.empty(2 * capacity) for _ in Window._fields[1:]))
 
     def append(self, v: float, y: float, other: float) -> None:
         kept, at = self._kept, self.end - self._kept.first
