@@ -190,28 +190,24 @@ def _compare(
 ) -> list[Compared]:
     """Fit the structures to the samples before `cut` and to all of them, from models whose gap and
     beginning are about right, and from those with a pole less."""
-    hopeless = 8.0  # times the squares of the best fit that a first part alone may leave
     train, later = replace(samples, last=cut), replace(samples, first=cut)
-    found: dict[Structure, Model] = {}
+    found: dict[Structure, tuple[Model, Model]] = {}
     for structure in sorted(structures, key=lambda s: s.order):
         begin = min(first_model(train, structure, like.gap, like.fit.p0) for like in candidates)
         smaller = found.get(replace(structure, order=structure.order - 1))
-        also = [smaller.begin_with_pole(0.6, structure)] if smaller else []
-        found[structure] = fitted(train, structure, begin.fit, *also, steps=FIRST_STEPS)
-    first = min(found.values())
-    best = fitted(samples, first.structure, first.fit)
-    whole = {structure: fitted(samples, structure, trained.fit)
-             for structure, trained in found.items() if trained.squares < hopeless * best.squares}
-    best = min(whole.values())
+        also = [smaller[0].begin_with_pole(0.6, structure)] if smaller else []
+        trained = fitted(train, structure, begin.fit, *also, steps=FIRST_STEPS)
+        found[structure] = trained, fitted(samples, structure, trained.fit)
+    best = min(whole for _, whole in found.values())
     count, rows = len(best.left), effective(best.left)
     compared = []
-    for structure, trained in ((one, found[one]) for one in whole):
+    for structure, (trained, whole) in found.items():
         error = later.fitted_y - _predicted(trained, later)
         error = error[np.isfinite(later.fitted_y)]
         rms = float(np.sqrt(np.mean(error**2)))
         compared.append(Compared(
-            structure, max(rms, EXACT) if np.isfinite(rms) else inf, trained, whole[structure],
-            rows * log(max(whole[structure].squares, EXACT**2 * count))
+            structure, max(rms, EXACT) if np.isfinite(rms) else inf, trained, whole,
+            rows * log(max(whole.squares, EXACT**2 * count))
             + structure.unknowns * log(max(rows, 1.0)), 1.0 / sqrt(2.0 * effective(error))))
     return compared
 
