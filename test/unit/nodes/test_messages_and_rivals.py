@@ -1,14 +1,15 @@
 """Parts of the nodes on their own: profiles, numbers as bytes, sections, plots, precedence."""
 
 import struct
+from contextlib import closing
 from math import inf, nan
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
 
 import pytest
 import yaml
 from rclpy.serialization import deserialize_message, serialize_message
+from ros_processes import Probe
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
 
@@ -18,6 +19,7 @@ from backlash_ros.nodes.control.publishing import watched_values
 from backlash_ros.nodes.control.rivals import ENDPOINT, SINCE, CommandLock, Rival, Rivals
 from backlash_ros.nodes.runtime import messages
 from backlash_ros.nodes.runtime.process import unreached
+from backlash_ros.tools.bringup.supervisor import free_domain
 
 HERE = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
 
@@ -52,12 +54,13 @@ def test_a_number_goes_out_and_comes_in_as_a_float64(number: float) -> None:
 
 
 def test_an_error_is_told_to_who_started_the_node(monkeypatch):
-    told = Mock()
-    monkeypatch.setattr(messages, 'emit', told)
-    monkeypatch.setattr(messages.Node, 'get_logger', Mock())
-    for level in messages.Level:
-        messages.DiagnosticsPublisher._write(Mock(_part='waist'), level, 'it stands still')
-    told.assert_called_once_with('complaint', text='waist: it stands still')
+    told = []
+    monkeypatch.setattr(messages, 'emit', lambda event, **fields: told.append((event, fields)))
+    with free_domain() as domain, closing(Probe(domain)) as probe:
+        publisher = messages.DiagnosticsPublisher(probe.node, '', 'waist')
+        for level in messages.Level:
+            publisher.publish(messages.Finding(level, 'rest', 'it stands still'), {})
+    assert told == [('complaint', {'text': 'waist: it stands still'})]
 
 
 JOINTS = (
