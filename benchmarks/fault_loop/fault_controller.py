@@ -86,9 +86,10 @@ class Controller:
         for i, o in enumerate(outputs):
             now_ns = driver.answered_ns
             self._clock.look(now_ns, now_ns - driver.offset_ns, o.stamp_ns)
-            set_ns = self._clock.of_stamps_ns
-            output = o._replace(stamp_ns=o.stamp_ns - set_ns, sent_ns=o.sent_ns - set_ns,
-                                received_ns=o.received_ns - self._clock.set_ns)
+            of_stamps_ns = self._clock.of_stamps_ns
+            output = o._replace(
+                stamp_ns=o.stamp_ns - of_stamps_ns, sent_ns=o.sent_ns - of_stamps_ns,
+                received_ns=o.received_ns - self._clock.set_ns)
             begins, core = loop.begins, loop.core
             step = loop.answer(output)
             if step is not None:

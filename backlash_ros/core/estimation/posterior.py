@@ -44,7 +44,7 @@ def step_of(y: Array) -> float:
 
 
 def likelihood(r: Array, noise_std: float, step: float, weights: Array) -> Likelihood:
-    """What readings, weighted (N,), say of outputs that they are off from by r (N,)."""
+    """What readings, weighted (N,), say of outputs that are off by r (N,); step 0: none."""
     if not step:
         return Likelihood(
             -0.5 * (r / noise_std) ** 2 - log(sqrt(2.0 * pi) * noise_std), r / noise_std**2,
@@ -52,9 +52,9 @@ def likelihood(r: Array, noise_std: float, step: float, weights: Array) -> Likel
     half = 0.5 * step / noise_std
     probability, score, curvature = _of_interval(r / noise_std, half)
     # What says nothing, deep within its interval, would leave unknowns open. Their sum stays.
-    mean = (weights @ curvature + 1e-9) / (weights.sum() + 1e-9)
-    information = np.maximum(curvature, mean)
-    information *= (weights @ curvature + 1e-9) / (weights @ information + 1e-9)
+    total = weights @ curvature + 1e-9  # of a reading, where none says anything
+    information = np.maximum(curvature, total / (weights.sum() + 1e-9))
+    information *= total / (weights @ information + 1e-9)
     return Likelihood(probability - log(step), score / noise_std, information / noise_std**2)
 
 
