@@ -104,7 +104,8 @@ def test_controllers_are_shown_and_the_selected_one_obeys_the_keys(tmp_path: Pat
         screen.press('c')
         driver.run_until(switched(driver, 'compensating', 'False'), 'to compensate no more')
         screen.press('s')
-        driver.run_until(saved.exists, 'the file')
+        driver.run_until(lambda: 'saved in' in screen.frame(), 'the answer')
+        assert saved.exists()
         screen.press('r')
         driver.run_until(lambda: 'once more' in screen.frame(), 'the question')
         assert driver.error() < 0.1
