@@ -98,7 +98,7 @@ def _measure(name: str, p: Parameters, samples: int) -> Result:
         penalty = None if error is None or best is None else error - best
     return Result(name, (
         run_record.control_error_rms(run), error, penalty,
-        run_record.total_variation(run.column('v')[run.column('t') >= since]),
+        float(np.abs(np.diff(run.column('v')[run.column('t') >= since])).sum()),
         run_record.gap_crossings_per_reversal(run, since),
     ), run, delay)
 

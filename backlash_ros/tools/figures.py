@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.identification.identification import Details, Identification
 from backlash_ros.core.identification.model import autocorrelation
-from backlash_ros.core.plant.backlash import Backlash
+from backlash_ros.core.plant.backlash import play
 from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.simulation import run_record
 from backlash_ros.core.simulation.run_record import RunRecord
@@ -195,10 +195,7 @@ def draw_hysteresis(run: RunRecord, end: Part) -> Figure:
     axes = figure.subplots()
     v, truth = run.column('v'), run.has_truth
     m, c_r, c_l = (float(run.column(name)[-1]) for name in BACKLASH)
-    u = run.column('u') if truth else m * (v - c_r)
-    if not truth and c_l < c_r:
-        backlash = Backlash(m, c_r, c_l)
-        u = np.array([backlash.step(each) for each in v.tolist()])
+    u = run.column('u') if truth else m * (play(v, max(c_r - c_l, 0.0), c_r) - c_r)
     span = np.array(limits([v[end.rows]], margin=0.15))
     for name, side, c in (('c_r', 'right', c_r), ('c_l', 'left', c_l)):
         if truth:

@@ -5,9 +5,8 @@ import sys
 from collections.abc import Sequence
 from functools import partial
 from itertools import product
-from math import isnan, nan
+from math import nan
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -24,17 +23,7 @@ from backlash_ros.tools.config import parse_setting
 from backlash_ros.tools.records.reading import read_run_or_log
 from backlash_ros.tools.report import REPORT_PAGE, write_report
 from backlash_ros.tools.runs.files import Run, result_directory, write_table
-from backlash_ros.tools.runs.read_run import find_bag, read_reports
 from backlash_ros.topics import BACKLASH
-
-
-class Source(NamedTuple):
-    """A recorded run, and what it is replayed with."""
-
-    path: Path
-    recorded: RunRecord
-    parameters: Parameters
-    reports: Sequence[Sequence[float]] = ()
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -49,34 +38,35 @@ def make_parser() -> argparse.ArgumentParser:
 def _replay(args: Sequence[str] | None) -> None:
     options = make_parser().parse_args(args)
     span, changes = cli.span_of(options), combinations(options.sweep)
-    sources = [_opened(path, options, span) for path in options.runs]
+    sources = [(path, *_opened(path, options, span)) for path in options.runs]
     if len(sources) * len(changes) == 1:
-        _one(sources[0], options.out)
+        [(path, source, parameters)] = sources
+        _one(path, source, parameters.replaced(changes[0]), options.out)
         return
     rows: list[tuple[str | float, ...]] = []
-    for source, change in product(sources, changes):
+    for (path, source, parameters), change in product(sources, changes):
         words = ' '.join(f'{name}={as_yaml(value)}' for name, value in change.items())
-        run = _replayed(source._replace(parameters=source.parameters.replaced(change)))
+        run = _replayed(path, source, parameters.replaced(change))
         tracking = run.column('t')[run.column('status') == Status.TRACKING].tolist()
         innovation = run.column('innovation')[run.samples // 2:]
         known = innovation[np.isfinite(innovation)]
         rows.append((
-            str(source.path), words,
+            str(path), words,
             *(float(run.column(std + name)[-1]) for std in ('', 'std_') for name in BACKLASH),
             next(iter(tracking), nan), float(np.sqrt(np.mean(known**2))) if len(known) else nan))
     header = ('run', 'changed', *BACKLASH, *(f'std_{name}' for name in BACKLASH),
               'tracking from [s]', 'innovation RMS')
-    path = result_directory(options.out) / 'replays.csv'
-    write_table(path, header, rows)
+    file = result_directory(options.out) / 'replays.csv'
+    write_table(file, header, rows)
     print(cli.format_table(header, [
         [cell if isinstance(cell, str) else cli.number(cell) for cell in row] for row in rows]))
-    print(path)
+    print(file)
 
 
-def _opened(path: Path, options: argparse.Namespace, span: cli.Span) -> Source:
-    run, applied = read_run_or_log(path, options.config, span, options.axis, options.columns)
-    for text in run.notes:
-        print(f'replay: {"warning: " if applied is None else ""}{text}', file=sys.stderr)
+def _opened(path: Path, options: argparse.Namespace, span: cli.Span) -> tuple[Run, Parameters]:
+    """A recorded run or a log, and the parameters to replay it with."""
+    run = read_run_or_log(path, options.config, span, options.axis, options.columns)
+    run.print_notes('replay')
     if run.parameters is None:
         raise cli.InputError(f'{path}: no parameters.yaml stands beside it: give --config, like '
                              'identified.yaml of `identify`')
@@ -84,37 +74,31 @@ def _opened(path: Path, options: argparse.Namespace, span: cli.Span) -> Source:
     if any(axis for axis, *_ in settings):
         raise cli.InputError('--set: leave out the axis: there is one run')
     parameters = run.parameters.replaced({name: value for _, name, value in settings})
-    if applied is not None:
-        # Its v is what acted, in every interval.
+    if not run.record.has_estimates:  # the v of a log is what acted, in every interval
         parameters = parameters.replaced({'estimator.use_applied_control': 'true'})
-        return Source(path, run.record, parameters, applied)
-    use, bag = report_use(parameters), find_bag(path)
-    reports = read_reports(bag, run.record.column('y'), options.axis) \
-        if use != 'false' and bag else []
-    if use == 'true' and not reports:
+    elif report_use(parameters) == 'true' and not run.applied:
         print(f'replay: warning: {path}: holds no applied_control: v is that of control',
               file=sys.stderr)
-    return Source(path, run.record, parameters, reports)
+    return run, parameters
 
 
-def _replayed(source: Source) -> RunRecord:
-    period, of_run = source.parameters.sample_period, source.recorded.sample_period
+def _replayed(path: Path, source: Run, parameters: Parameters) -> RunRecord:
+    period, of_run = parameters.sample_period, source.record.sample_period
     if abs(period / of_run - 1.0) >= 0.01:
-        raise ParameterError('sample_period', period, f'must be that of {source.path}, {of_run:g}')
+        raise ParameterError('sample_period', period, f'must be that of {path}, {of_run:g}')
     try:
-        return replay(source.recorded, source.parameters, source.reports)
+        return replay(source.record, parameters, source.applied)
     except ParameterError:
         raise
     except ValueError as error:
         raise cli.BrokenOffError(f'the replay broke off: {error}') from error
 
 
-def _one(source: Source, out: Path | None) -> None:
-    recorded = source.recorded
-    replayed = _replayed(source)
-    cli.print_warnings('replay', source.parameters)
+def _one(path: Path, source: Run, parameters: Parameters, out: Path | None) -> None:
+    recorded, replayed = source.record, _replayed(path, source, parameters)
+    cli.print_warnings('replay', parameters)
     directory = result_directory(out)
-    summary = write_report(Run(replayed, source.parameters), directory)
+    summary = write_report(Run(replayed, parameters), directory)
     write_atomically(directory / 'replay.png',
                      figures.png(figures.draw_estimates(replayed, recorded)))
     print(cli.format_table(('', 'run', 'replay', '±'), [
@@ -122,7 +106,7 @@ def _one(source: Source, out: Path | None) -> None:
          cli.number(summary['final_std'][name], 2)) for name in BACKLASH
     ]))
     status, parted = replayed.column('status'), parting(recorded, replayed)
-    if isnan(recorded.column('m')[-1]):  # of a log, which has no estimates to compare with
+    if not recorded.has_estimates:  # there is nothing to compare with
         begins = np.append(0, np.flatnonzero(np.diff(status)) + 1)
         states = [f'{Status(int(status[k])).word} from {replayed.column("t")[k]:.3g} s'
                   for k in begins[:8]]

@@ -31,15 +31,12 @@ HTML_SYMBOLS = {'m': 'm', 'c_r': 'c<sub>r</sub>', 'c_l': 'c<sub>l</sub>'}
 def write_report(run: files.Run, out: Path) -> dict[str, Any]:
     """Write report, figures, samples.csv and summary.json of a run to out; return the summary."""
     summary = told.summarise(run.record, run.parameters, run.latency_s)
-    notes, lost = list(run.notes), summary['lost_samples']
-    if lost > 0.01 * (total := lost + summary['samples']) \
-            and not (run.parameters and run.parameters.output_loss):
-        notes.append(f'{lost} of {total} samples were lost: was the machine too busy for '
-                     'this sample period, or the driver or its sensor silent?')
-    # Of a log, which has no estimates, it is what was made of its rows.
-    of_log = np.isnan(run.record.column('m')[-1])
-    for note in notes:
-        print(f'report: {"" if of_log else "warning: "}{note}', file=sys.stderr)
+    lost, total = summary['lost_samples'], summary['lost_samples'] + summary['samples']
+    if lost > 0.01 * total and not (run.parameters and run.parameters.output_loss):
+        run = run._replace(notes=(*run.notes, (
+            f'{lost} of {total} samples were lost: was the machine too busy for this sample '
+            'period, or the driver or its sensor silent?')))
+    run.print_notes('report')
     files.write_run(run.record, out)
     files.write_summary(summary, out / 'summary.json')
     folded = None
@@ -48,7 +45,7 @@ def write_report(run: files.Run, out: Path) -> dict[str, Any]:
         write_atomically(out / files.CONFIG_FILE, folded[1])
     write_page(
         out / REPORT_PAGE, 'Adaptive backlash inverse control', headline(summary),
-        [f'{note}.' for note in notes], [_tables(summary)],
+        [f'{note}.' for note in run.notes], [_tables(summary)],
         list(_figures(run.record, run.parameters, summary)), folded)
     return summary
 
@@ -56,7 +53,7 @@ def write_report(run: files.Run, out: Path) -> dict[str, Any]:
 def _figures(
     run: RunRecord, parameters: Parameters | None, summary: Mapping[str, Any],
 ) -> Iterator[Picture]:
-    if not np.isfinite(run.column('m')).any():
+    if not run.has_estimates:
         yield Picture('log.png', 'v and y', 'What the log holds. With play, y over v is a loop '
                       'with level stretches where v turns.', png(figures.draw_log(run)))
         return
@@ -150,8 +147,8 @@ def make_parser() -> argparse.ArgumentParser:
 
 def _report(args: Sequence[str] | None) -> None:
     options = make_parser().parse_args(args)
-    run, _ = read_run_or_log(options.path.resolve(), options.config, cli.span_of(options),
-                             options.axis, options.columns)
+    run = read_run_or_log(options.path.resolve(), options.config, cli.span_of(options),
+                          options.axis, options.columns)
     out = files.result_directory(options.out)
     write_report(run, out)
     print(out / REPORT_PAGE)

@@ -49,9 +49,7 @@ class ClosedLoop:
             controller.lost_samples + lost, learned_model_of(controller.estimator, p))
 
 
-def build_closed_loop(p: Parameters) -> ClosedLoop:
-    """The loop of the given parameters."""
-    return ClosedLoop(p)
+build_closed_loop = ClosedLoop  # the public name, as of all that is built from parameters
 
 
 def replay(

@@ -108,6 +108,11 @@ class RunRecord:
         return len(self.rows)
 
     @property
+    def has_estimates(self) -> bool:
+        """Whether a controller made it, and not a log of v and y alone."""
+        return bool(np.isfinite(self.column('m')).any())
+
+    @property
     def has_truth(self) -> bool:
         return bool(np.isfinite(self.column('true_m')).all()) and self.samples > 0
 
@@ -147,10 +152,6 @@ def delayed_tracking_error_rms(run: RunRecord, delay: int, since: float = 0.0) -
         return None
     error = run.column('y')[rows] - reference
     return float(np.sqrt(np.mean(error**2) / np.mean(reference**2)))
-
-
-def total_variation(values: Array) -> float:
-    return float(np.abs(np.diff(values)).sum())
 
 
 def turns(values: Array, least: float) -> int:

@@ -1,6 +1,6 @@
 """A record from whatever a user has: a table, a folder of results, a bag; or the same as a run."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -70,11 +70,10 @@ def _is_table(path: Path) -> bool:
 def read_run_or_log(
     path: Path, config: Path | None = None, span: Span = WHOLE_SPAN, axis: str = '',
     columns: Mapping[str, str] = NO_COLUMNS,
-) -> tuple[Run, Sequence[Sequence[float]] | None]:
+) -> Run:
     """A run of this package; or a log, as `read_record` takes it, as a run without estimates.
 
-    And for a log the v of every interval before each row, None for a run. config: parameters, by
-    default those beside a run. Raises InputError.
+    config: parameters, by default those beside a run. Raises InputError.
     """
     from backlash_ros.tools.runs.read_run import find_bag, read_run
     no_run: InputError | None = None
@@ -83,7 +82,7 @@ def read_run_or_log(
             run = read_run(path, config, span, axis)
             if not run.record.samples:
                 raise InputError(f'{path}: holds no sample')
-            return run, None
+            return run
         except InputError as error:
             if find_bag(path) is None:
                 raise
@@ -104,7 +103,7 @@ def read_run_or_log(
                     'y': record.y[known], 'v': record.v[known]})
     run_record = RunRecord(
         rows, record.sample_period, int(known[-1] - known[0] + 1 - len(known)))
-    return Run(run_record, parameters, None, (record.timing, *record.notes)), applied
+    return Run(run_record, parameters, None, (record.timing, *record.notes), applied)
 
 
 def _is_samples(path: Path) -> bool:

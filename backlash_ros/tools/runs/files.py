@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import os
+import sys
 import zipfile
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -29,13 +30,21 @@ class Run(NamedTuple):
     """A run that was simulated or recorded; parameters are None where they are unknown.
 
     latency_s: from the departure of y(k) at the driver to that of v(k) at the controller, shape
-    (N,); None for a simulation. notes: on the source, a sentence each.
+    (N,); None for a simulation. notes: on the source, a sentence each. applied: the v that acted
+    since the row before, for each row, as far as the driver or a log tells it; empty for nothing.
     """
 
     record: RunRecord
     parameters: Parameters | None
     latency_s: Array | None = None
     notes: tuple[str, ...] = ()
+    applied: Sequence[Sequence[float]] = ()
+
+    def print_notes(self, tool: str) -> None:
+        # Of a log they are what was made of its rows.
+        warning = 'warning: ' if self.record.has_estimates else ''
+        for note in self.notes:
+            print(f'{tool}: {warning}{note}', file=sys.stderr)
 
 
 def result_directory(out: Path | None) -> Path:

@@ -1,6 +1,6 @@
 """Runs from bags, joined on the number of the sample, from folders of results, from simulation."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import chain
@@ -25,6 +25,8 @@ from backlash_ros.tools.runs.files import BAG, CONFIG_FILE, RECORD_FILE, SAMPLES
 Messages = list[tuple[int, Any]]  # with their stamps [ns], in the order of these
 # Rows of an array topic: a field for each of its labels, and `stamp` [ns] since the first signals.
 Table = NDArray[np.void]
+
+NUMBER, ARRAY = 'std_msgs/msg/Float64', 'std_msgs/msg/Float64MultiArray'  # types of messages
 
 
 def read_run(
@@ -122,25 +124,6 @@ def topic_ends_like(name: str, topic: str) -> bool:
     return f'/{name}'.endswith(f'/{topic}')
 
 
-def read_reports(path: Path, y: Array, axis: str = '') -> list[list[float]]:
-    """What applied_control reported between each output y (N,) of a run and the one before it.
-
-    Empty where there is none, or the outputs are not all found by their values.
-    """
-    heard, _, _ = read_topics(path, lambda topic: topic.message_type == 'std_msgs/msg/Float64')
-    outputs, reports = (heard.get(choose_namespace(
-        sorted(name for name in heard if topic_ends_like(name, topic)), axis,
-    )[0], []) for topic in (topics.PLANT_OUTPUT, topics.APPLIED_CONTROL))
-    remaining = iter(outputs)
-    stamps = [next((stamp for stamp, message in remaining if message.data == value), -1)
-              for value in y.tolist()]
-    if -1 in stamps or not reports:
-        return []
-    ends = np.searchsorted([stamp for stamp, _ in reports], stamps, side='right')
-    values = np.array([message.data for _, message in reports])
-    return [[], *(part.tolist() for part in np.split(values, ends)[1:-1])]
-
-
 def read_bag(
     path: Path, sample_period: float | None = None, span: Span = WHOLE_SPAN, axis: str = '',
 ) -> Run:
@@ -148,8 +131,9 @@ def read_bag(
 
     sample_period: None takes the median distance of the stamps. Raises InputError.
     """
-    recorded, names, damage = read_topics(
-        path, lambda topic: topic.message_type == 'std_msgs/msg/Float64MultiArray')
+    of_driver = topics.PLANT_OUTPUT, topics.APPLIED_CONTROL
+    recorded, names, damage = read_topics(path, lambda topic: topic.message_type == ARRAY or (
+        topic.message_type == NUMBER and topic.name.endswith(of_driver)))
     try:
         found, prefix, notes = _of_axis(recorded, names, axis)
         begin_ns = found[topics.SIGNALS][0][0]
@@ -188,7 +172,27 @@ def read_bag(
         label: table[label] for table in (signals, estimates) for label in table.dtype.names or ()}}
     record = RunRecord(files.rows_of(columns), sample_period,
                        int(heard[-1] - heard[0]) + 1 - len(heard), learned)
-    return Run(record, None, columns['latency_s'], tuple(filter(None, [damage, *notes, restarted])))
+    return Run(record, None, columns['latency_s'],
+               tuple(filter(None, [damage, *notes, restarted])),
+               _reports(recorded, columns['y'], axis))
+
+
+def _reports(recorded: Mapping[str, Messages], y: Array, axis: str) -> list[list[float]]:
+    """What applied_control reported between each output y (N,) and the one before it.
+
+    Empty where there is none, or the outputs are not all found by their values.
+    """
+    outputs, reports = (recorded.get(choose_namespace(
+        sorted(name for name in recorded if topic_ends_like(name, topic)), axis,
+    )[0], []) for topic in (topics.PLANT_OUTPUT, topics.APPLIED_CONTROL))
+    remaining = iter(outputs if reports else ())
+    stamps = [next((stamp for stamp, message in remaining if message.data == value), -1)
+              for value in y.tolist()]
+    if -1 in stamps:
+        return []
+    ends = np.searchsorted([stamp for stamp, _ in reports], stamps, side='right')
+    values = np.array([message.data for _, message in reports])
+    return [[], *(part.tolist() for part in np.split(values, ends)[1:-1])]
 
 
 def _of_axis(
@@ -197,7 +201,8 @@ def _of_axis(
     """The messages of one axis by topic; the prefix of its labels if it is a joint; notes."""
     found: dict[str, Messages] = {}
     prefix, notes = '', list[str]()
-    labels_of = {name: _labels(messages[0][1]) for name, messages in recorded.items()}
+    labels_of = {name: _labels(messages[0][1]) for name, messages in recorded.items()
+                 if messages[0][1].__msgtype__ == ARRAY}
     for topic, labels in topics.LABELS_OF.items():  # signals first
         # The nodes may have been renamed.
         names = sorted(name for name, given in labels_of.items()
