@@ -12,7 +12,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from backlash_ros import topics
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.simulation.run_record import COLUMNS, LearnedModel, RunRecord
+from backlash_ros.core.simulation.run_record import COLUMNS, MODEL_LABELS, RunRecord
 
 PARAMETERS = Parameters({'estimator.law': 'lms', 'output_noise_std': 1e-4})
 LATENCY_S = 0.0004
@@ -84,6 +84,5 @@ def write_bag(
 
 
 def believed(denominator: list[float]) -> bytes:
-    fields = LearnedModel((0.1,), tuple(denominator), 1, (0.1,) * 5, 1.2, 0.03).fields()
-    label, values = list(fields.items())[-1]
-    return multi_array({**fields, label: values[:-1]})
+    fields = {**dict.fromkeys(MODEL_LABELS, (0.1,)), 'denominator': denominator}
+    return multi_array({**fields, MODEL_LABELS[-1]: []})

@@ -21,7 +21,7 @@ from std_msgs.msg import Float32, Float64, Float64MultiArray
 
 from backlash_ros import topics
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.simulation.run_record import from_fields
+from backlash_ros.core.simulation.run_record import complete_model
 
 TYPES = {'std_msgs/msg/Float64': Float64, 'std_msgs/msg/Float64MultiArray': Float64MultiArray}
 # What the shipped layouts draw: PlotJuggler writes /topic/field[0], Foxglove /topic.field[0].
@@ -241,7 +241,7 @@ def test_what_a_controller_publishes_is_what_layouts_show_and_latecomers_hear(tm
         for dimension in models[0].layout.dim:
             fields[dimension.label] = list(models[0].data[first:first + dimension.size])
             first += dimension.size
-        assert from_fields(fields).numerator == Parameters({}).plant.numerator
+        assert complete_model(fields)['numerator'] == Parameters({}).plant.numerator
         driver.rest()
         present = dict(driver.probe.node.get_topic_names_and_types())
         heard: dict[str, list[Any]] = {}

@@ -21,7 +21,16 @@ SETTLING_TOLERANCE = 0.01  # of the true value
 # At which the response of G is judged, as shares of the sampling rate: from slow motion to where
 # little is left of it.
 FREQUENCIES: tuple[float, ...] = tuple(np.geomspace(0.01, 0.2, 5).tolist())
-STD_LABELS = tuple(f'response_std_at_{share:.4g}_of_sampling_rate' for share in FREQUENCIES)
+# Of what was believed of G, in the order of `controller/model`.
+MODEL_LABELS = (
+    'numerator', 'denominator', 'delay_samples',
+    *(f'response_std_at_{share:.4g}_of_sampling_rate' for share in FREQUENCIES),
+    'noise_ratio', 'unexplained',
+)
+# G(z) = z^-delay_samples numerator / denominator, in descending powers of z, by MODEL_LABELS.
+# response_std: relative deviation |dG/G| of the true response from it; the gain at rest is part of
+# m. noise_ratio, unexplained: as in LawReport. These are nan where the law does not learn them.
+LearnedModel = Mapping[str, tuple[float, ...]]
 
 
 def stated_deviations(e: Estimate) -> tuple[float, float, float]:
@@ -41,49 +50,23 @@ def row_of(
     )
 
 
-@dataclass(frozen=True)
-class LearnedModel:
-    """G(z) = z^-delay_samples numerator / denominator, in descending powers of z.
-
-    response_std: relative standard deviation |dG/G| of the true response from it at FREQUENCIES;
-    the gain at rest is part of m. noise_ratio and unexplained: as in LawReport. All three are nan
-    where nothing was learned, or the law does not learn it.
-    """
-
-    numerator: tuple[float, ...]
-    denominator: tuple[float, ...]
-    delay_samples: int
-    response_std: tuple[float, ...] = (nan,) * len(FREQUENCIES)
-    noise_ratio: float = nan
-    unexplained: float = nan
-
-    def fields(self) -> dict[str, tuple[float, ...]]:
-        """All numbers under the labels of `controller/model`, in their order."""
-        return {
-            'numerator': self.numerator, 'denominator': self.denominator,
-            'delay_samples': (float(self.delay_samples),),
-            **{label: (std,) for label, std in zip(STD_LABELS, self.response_std, strict=True)},
-            'noise_ratio': (self.noise_ratio,), 'unexplained': (self.unexplained,),
-        }
-
-
-def from_fields(fields: Mapping[str, Sequence[float]]) -> LearnedModel:
-    """The inverse of `fields`; raises KeyError, IndexError or ValueError for what is none."""
-    return LearnedModel(
-        tuple(map(float, fields['numerator'])), tuple(map(float, fields['denominator'])),
-        int(fields['delay_samples'][0]), tuple(float(fields[label][0]) for label in STD_LABELS),
-        float(fields['noise_ratio'][0]), float(fields['unexplained'][0]),
-    )
-
-
 def learned_model_of(law: Law, p: Parameters) -> LearnedModel:
     """What a law believes of G now: that of the parameters where it does not learn it."""
     learned, report = law.learned_model, law.report
     model = build_model(p) if learned is None else learned.transfer_function
     response_std = law.response_std(np.exp(2j * np.pi * np.array(FREQUENCIES)))
     numerator, denominator, delay = model.without_delay()
-    return LearnedModel(tuple(numerator), tuple(denominator), delay, tuple(response_std.tolist()),
-                        report.noise_ratio, report.unexplained)
+    numbers = [delay, *response_std.tolist(), report.noise_ratio, report.unexplained]
+    return dict(zip(MODEL_LABELS, (
+        tuple(numerator), tuple(denominator), *((float(number),) for number in numbers),
+    ), strict=True))
+
+
+def complete_model(fields: Mapping[str, Sequence[float]]) -> LearnedModel | None:
+    """The model of a message or a file; None where numbers are missing."""
+    if not all(fields.get(label) for label in MODEL_LABELS):
+        return None
+    return {label: tuple(fields[label]) for label in MODEL_LABELS}
 
 
 @dataclass(frozen=True)

@@ -147,7 +147,7 @@ class ModelPublisher:
 
     def publish(self, loop: ControlLoop, p: Parameters, wait_s: int = 0) -> None:
         """Publish at once. wait_s: how long at most until who listens has it."""
-        fields = learned_model_of(loop.core.estimator, p).fields()
+        fields = learned_model_of(loop.core.estimator, p)
         message = Float64MultiArray(data=array('d', chain(*fields.values())))
         message.layout.dim = [
             MultiArrayDimension(label=topics.of_joint(label, self._joint), size=len(values))

@@ -18,7 +18,7 @@ import numpy as np
 from backlash_ros.atomic_file import point_link, write_atomically
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.transfer_function import Array
-from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord, from_fields
+from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord, complete_model
 from backlash_ros.tools.cli import InputError
 
 SAMPLES_FILE, RECORD_FILE = 'samples.csv', 'record.npz'
@@ -87,8 +87,8 @@ def write_run(run: RunRecord, directory: Path) -> None:
     """Write samples.csv for everyone, and record.npz with all that `report` can draw."""
     columns = np.column_stack([run.column(name) for name in SAMPLE_COLUMNS])
     write_table(directory / SAMPLES_FILE, SAMPLE_COLUMNS, columns.tolist())
-    learned = run.learned.fields() if run.learned is not None else {}
-    arrays: dict[str, Any] = {f'learned.{label}': values for label, values in learned.items()}
+    arrays: dict[str, Any] = {
+        f'learned.{label}': values for label, values in (run.learned or {}).items()}
     buffer = io.BytesIO()
     np.savez_compressed(
         buffer, columns=np.array(COLUMNS), rows=run.rows, sample_period=run.sample_period,
@@ -111,7 +111,7 @@ def read_record(path: Path) -> RunRecord:
             return RunRecord(
                 rows_of(dict(zip(stored['columns'].tolist(), stored['rows'].T, strict=True))),
                 float(stored['sample_period']), int(stored['lost_samples']),
-                from_fields(fields) if fields else None)
+                complete_model(fields))
     except (OSError, KeyError, ValueError, IndexError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f'{path}: is not a record of a run: {error}') from None
 

@@ -1,7 +1,6 @@
 """Runs from bags, joined on the number of the sample, from folders of results, from simulation."""
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from itertools import chain
 from math import isnan
@@ -16,7 +15,12 @@ from backlash_ros import topics
 from backlash_ros.bags import REPAIR_COMMAND, BagError, BagReader, Topic, is_bag
 from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.simulation.closed_loop import ClosedLoop
-from backlash_ros.core.simulation.run_record import COLUMNS, LearnedModel, RunRecord, from_fields
+from backlash_ros.core.simulation.run_record import (
+    COLUMNS,
+    LearnedModel,
+    RunRecord,
+    complete_model,
+)
 from backlash_ros.tools.cli import WHOLE_SPAN, BrokenOffError, InputError, Span
 from backlash_ros.tools.config import read_configuration
 from backlash_ros.tools.runs import files
@@ -287,7 +291,7 @@ def _newest_model(messages: Sequence[Any], prefix: str) -> LearnedModel | None:
         parts = zip(_labels(message), np.split(message.data, ends), strict=False)
         fields = {label.removeprefix(prefix): values.tolist() for label, values in parts
                   if label.startswith(prefix)}
-        with suppress(KeyError, IndexError, ValueError):
-            if not all(map(isnan, chain(*fields.values()))):
-                return from_fields(fields)
+        model = complete_model(fields)
+        if model and not all(map(isnan, chain(*model.values()))):
+            return model
     return None

@@ -67,10 +67,10 @@ def summarise(
         'status_share': {word: float(np.mean(status == state)) for state, word in words.items()}
         if status.size else None,
         'model': learned and {
-            'numerator': list(learned.numerator), 'denominator': list(learned.denominator),
-            'delay_samples': learned.delay_samples},
-        'noise_ratio': learned and learned.noise_ratio,
-        'unexplained': learned and learned.unexplained,
+            'numerator': list(learned['numerator']), 'denominator': list(learned['denominator']),
+            'delay_samples': int(learned['delay_samples'][0])},
+        'noise_ratio': learned and learned['noise_ratio'][0],
+        'unexplained': learned and learned['unexplained'][0],
     }
 
 

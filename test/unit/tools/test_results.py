@@ -11,7 +11,6 @@ import pytest
 from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core import Parameters, build_closed_loop
 from backlash_ros.core.simulation import run_record
-from backlash_ros.core.simulation.run_record import LearnedModel
 from backlash_ros.tools.cli import InputError
 from backlash_ros.tools.runs import files as results
 from backlash_ros.tools.runs.summary import summarise
@@ -25,7 +24,9 @@ def without_truth(run: run_record.RunRecord) -> run_record.RunRecord:
 
 
 OLD_HEADER = 't,y_m,y,u_d,v,u,m,c_r,c_l,f'  # of samples.csv before version 0.3
-LEARNED = LearnedModel((0.1, 0.05), (1.0, -0.9), 1, (0.1, 0.2, 0.3, 0.4, nan), 1.1, 0.02)
+LEARNED = dict(zip(run_record.MODEL_LABELS, (
+    (0.1, 0.05), (1.0, -0.9), (1.0,), (0.1,), (0.2,), (0.3,), (0.4,), (nan,), (1.1,), (0.02,),
+), strict=True))
 
 
 @pytest.fixture(scope='module')
