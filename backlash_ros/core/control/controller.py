@@ -60,7 +60,7 @@ class AdaptiveController:
         self.compensating, self.lost_samples = True, 0
         self.redesign = Redesign((executor or Executor()).open()) if redesign else None
         self._serial = serial
-        self._interval: Interval | None = None  # that which began with the newest command
+        self._led: tuple[float, float, float] | None = None  # newest v, y_m and u_d led to it
 
     def step(
         self, y: float, y_m: float, lost: int = 0, applied: Sequence[float] = (),
@@ -72,35 +72,35 @@ class AdaptiveController:
         if it is known: applied, the v that was; commands, those that acted if not the last one;
         alternatives, those that may have acted instead, nan where none may.
         """
-        if not all(map(plausible, (y, y_m, *applied, *commands))):
+        if not (plausible(y) and plausible(y_m) and all(map(plausible, (*applied, *commands)))):
             raise ValueError(
                 f'y={y!r}, y_m={y_m!r}, applied={applied!r} and commands={commands!r} must be '
                 f'finite and no larger than {LARGEST_SIGNAL:g}')
         serial, inverse = self._serial, self.inverse
-        if (before := self._interval) is not None:
+        if self._led is not None:
+            sent, y_m_before, u_d_before = self._led
             self.lost_samples += lost
             for i in range(lost + 1):
                 heard, other = y if i == lost else None, nan
-                command = commands[i] if commands else before.v
+                command = commands[i] if commands else sent
                 v = applied[i] if applied else None
                 if serial is not None:
                     v = serial.update(heard, command, v, self.estimator.estimate)
                 elif v is None:
                     v, other = command, alternatives[i] if alternatives else nan
-                self.estimator.update(heard, Interval(v, before.y_m, before.u_d, other))
+                self.estimator.update(heard, Interval(v, y_m_before, u_d_before, other))
         used = estimate = self.estimator.estimate
         if not self.compensating:
             used = replace(estimate, c_r=0.0, c_l=0.0)
         elif serial is not None:
             used = serial.for_command(estimate)
-        gap = used.c_r - used.c_l
-        crossing = max(gap / inverse.take_up, self.limits.samples_across(gap))
-        inputs = ControlInput(y_m, y, used, self._source, crossing)
+        inputs = ControlInput(y_m, y, used, self._source, self.limits)
         u_d, v = self.structure.control(inputs, inverse)
         self.motion = self.limits.apply(v, self.motion)
-        inverse.applied(self.motion.v)
-        self._interval = Interval(self.motion.v, y_m, u_d)
-        return ControlStep(y_m, y, u_d, self.motion.v, estimate)
+        v = self.motion.v
+        inverse.applied(v)
+        self._led = v, y_m, u_d
+        return ControlStep(y_m, y, u_d, v, estimate)
 
     def refine(self) -> None:
         """Do what the command did not have to wait for; who has no time for it leaves it out."""

@@ -2,7 +2,7 @@
 
 from math import inf, nan
 
-from backlash_ros.core.plant.backlash import Region, clamp
+from backlash_ros.core.plant.backlash import GAP, LEFT, RIGHT, Region, clamp
 
 
 class BacklashInverse:
@@ -16,7 +16,7 @@ class BacklashInverse:
     def __init__(self, direction_band: float = 0.0, take_up: float = inf) -> None:
         self.direction_band, self.take_up = direction_band, take_up
         # Line in use, GAP until u_d moves for the first time, and furthest u_d on it.
-        self.v, self.side, self.extreme = 0.0, Region.GAP, 0.0
+        self.v, self.side, self.extreme = 0.0, GAP, 0.0
         self.taking_up = False  # whether v is still on its way to the line
         self._slowed = False  # whether it is until it is where u_d wants it
         self.limited = False  # whether the last v could not be applied as it was
@@ -26,9 +26,9 @@ class BacklashInverse:
     def direction(self, u_d: float, band: float) -> Region:
         """Line on which u_d lies: RIGHT going up, LEFT going down, GAP where v is held."""
         move = u_d - self.extreme
-        side = Region.RIGHT if move > 0.0 else Region.LEFT if move < 0.0 else Region.GAP
+        side = RIGHT if move > 0.0 else LEFT if move < 0.0 else GAP
         # Only a turn has to leave the band; going on in the same direction is never noise.
-        return side if band == 0.0 or side is self.side or abs(move) > band else Region.GAP
+        return side if band == 0.0 or side is self.side or abs(move) > band else GAP
 
     def step(
         self, u_d: float, m: float, c_r: float, c_l: float, band: float | None = None,
@@ -36,19 +36,19 @@ class BacklashInverse:
         """Return v(t) for u_d(t) and the parameters in use (2.3); band: not direction_band."""
         band = self.direction_band if band is None else band
         side = self.direction(u_d, band)
-        if self.taking_up and self.side is not Region.GAP:
+        if self.taking_up and self.side is not GAP:
             # u is held until v arrives: it turns only where u_d lies on the other side of that.
             self._note_on_the_way()
             side = Region(-self.side) if (self._u - u_d) * self.side > band else self.side
-        elif self.side is Region.GAP and side is not Region.GAP:
+        elif self.side is GAP and side is not GAP:
             self.side, self._u, self.taking_up = side, self.extreme, True
         return self.follow(side, u_d, m, c_r, c_l)
 
     def follow(self, side: Region, u_d: float, m: float, c_r: float, c_l: float) -> float:
         """Return v for u_d on the line of a side, on which it only goes on; else u is held."""
-        if side is Region.GAP:
+        if side is GAP:
             return self.v
-        if self.side is Region.GAP:
+        if self.side is GAP:
             self._u = u_d  # nobody knows what u is
         elif self.taking_up:
             self._note_on_the_way()
@@ -71,7 +71,7 @@ class BacklashInverse:
         """Return v, on its way to the line no faster than the gap is crossed until it moves u."""
         if not self.taking_up:
             return self.v
-        crossing = c_r if self.side is Region.RIGHT else c_l
+        crossing = c_r if self.side is RIGHT else c_l
         # Where v begins to move u, or would have stood if these parameters had been in use before.
         way = (self.extreme if self._slowed else self._u) / m + crossing - self.v
         if abs(way) > self.take_up:
@@ -88,7 +88,7 @@ class BacklashInverse:
 
     def resume(self, m: float, c_r: float, c_l: float) -> float:
         """Return the u_d with which v stays where it is, for these parameters from now on."""
-        if self.side is not Region.GAP and self._play != (m, c_r, c_l):
+        if self.side is not GAP and self._play != (m, c_r, c_l):
             self._play = m, c_r, c_l
             self.extreme = self._u_at(self.v)
             self.taking_up = self._slowed = False
@@ -96,7 +96,7 @@ class BacklashInverse:
 
     def start_from(self, v: float) -> None:
         """Say which v acts before the next step, whatever was sent."""
-        if v != self.v and self.side is not Region.GAP:
+        if v != self.v and self.side is not GAP:
             self.extreme = self._u_at(v)
         self.v = v
 
@@ -114,7 +114,7 @@ class BacklashInverse:
 
     def _u_at(self, v: float) -> float:
         m, c_r, c_l = self._play
-        return m * (v - (c_r if self.side is Region.RIGHT else c_l))
+        return m * (v - (c_r if self.side is RIGHT else c_l))
 
     def _note_on_the_way(self) -> None:
         """Note what v has made of u since it left for its line."""

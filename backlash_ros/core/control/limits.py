@@ -6,6 +6,7 @@ from math import floor, inf, isnan, sqrt
 from typing import NamedTuple
 
 from backlash_ros.core.parameters import ParameterError, Parameters
+from backlash_ros.core.plant.backlash import clamp
 
 LARGEST_SIGNAL = 1e12  # no unit makes a measurement larger; squares of it still are numbers
 
@@ -59,11 +60,11 @@ class Limits:
         brakes in time for bounds and target, and joins one that moves steadily without a lag.
         """
         # Beyond the largest measurement nobody could tell what v does.
-        target = min(max(before.v if isnan(v) else v, self.low, -LARGEST_SIGNAL), self.high,
-                     LARGEST_SIGNAL)
+        target = clamp(clamp(before.v if isnan(v) else v, self.low, self.high),
+                       -LARGEST_SIGNAL, LARGEST_SIGNAL)
         v, most = before.v, self.acceleration
         if most == inf:
-            sent = min(max(target, v - self.move), v + self.move)
+            sent = clamp(target, v - self.move, v + self.move)
             return Motion(sent, sent - v, target)
         asked = pace = target - before.target
         if abs(pace) > self.move or abs(pace - before.pace) > most:

@@ -10,10 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from backlash_ros.core.control.inverse import BacklashInverse
+from backlash_ros.core.control.limits import Limits
 from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.law import StateSource
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.plant.backlash import Region
+from backlash_ros.core.plant.backlash import GAP, LEFT, RIGHT, Region
 from backlash_ros.core.plant.numerics import FourBlocks
 from backlash_ros.core.plant.transfer_function import Array, StateModel
 
@@ -32,7 +33,7 @@ class ControlInput(NamedTuple):
     y: float
     estimate: Estimate
     source: StateSource
-    crossing: float = 0.0  # samples that v takes across the gap, by its limits
+    limits: Limits = Limits()  # that v meets
 
 
 class Command(NamedTuple):
@@ -90,7 +91,7 @@ class Proportional(ControlStructure):
         """Return u_d and v that satisfy (3.2) and (2.3) together."""
         y_m, e, band = inputs.y_m, inputs.estimate, inverse.direction_band
         m, c_r, c_l, f = e.m, e.c_r, e.c_l, min(e.f, LARGEST_F_OVER_M * e.m)
-        if f == 0.0 and not inverse.taking_up and inverse.direction(y_m, band) is Region.GAP:
+        if f == 0.0 and not inverse.taking_up and inverse.direction(y_m, band) is GAP:
             return Command(y_m, inverse.v)  # first case of (2.3)
         before, self._estimate = self._estimate, e
         if before is not None and before is not e and inverse.take_up < inf:
@@ -107,17 +108,17 @@ class Proportional(ControlStructure):
         right, left = m * (y_m + f * c_r) / (m - f), m * (y_m + f * c_l) / (m - f)
         # Where both directions solve the loop, the smaller move is the one a shaft would make.
         v, held = inverse.v, y_m + f * inverse.v
-        solutions = (Region.RIGHT, right), (Region.LEFT, left)
+        solutions = (RIGHT, right), (LEFT, left)
         if abs(right / m + c_r - v) > abs(left / m + c_l - v):
             solutions = solutions[1], solutions[0]
         if inverse.taking_up:
             for side, u_d in solutions:
-                if side is inverse.side and inverse.direction(u_d, band) is Region.GAP:
+                if side is inverse.side and inverse.direction(u_d, band) is GAP:
                     v = inverse.step(u_d, m, c_r, c_l, band)  # u_d rests, v goes on to its line
                     return Command(y_m + f * v, v)
         elif (
             abs(held - inverse.extreme) <= 1e-12 * (abs(held) + abs(v))  # but for rounding
-            or inverse.direction(held, band) is Region.GAP
+            or inverse.direction(held, band) is GAP
         ):
             return Command(held, v)  # first case of (3.3): u_d rests, and so does v
         for side, u_d in solutions:
@@ -136,7 +137,7 @@ class Proportional(ControlStructure):
 
 def _on_the_line(y_m: float, e: Estimate, side: Region) -> float:
     """v on the line of a side."""
-    c = e.c_r if side is Region.RIGHT else e.c_l
+    c = e.c_r if side is RIGHT else e.c_l
     return c + (y_m + e.f * c) / (e.m - min(e.f, LARGEST_F_OVER_M * e.m))
 
 

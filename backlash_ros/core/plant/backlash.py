@@ -24,6 +24,9 @@ class Region(IntEnum):
     RIGHT = 1  # upward active: u = m (v - c_r)
 
 
+LEFT, GAP, RIGHT = Region  # by name in this module: a member of the class is slow to look up
+
+
 def clamp(held: float, low: float, high: float) -> float:
     """What a play holds: the value before, moved by the wall that it meets, (2.1)."""
     return low if held <= low else high if held >= high else held

@@ -137,7 +137,7 @@ def test_a_step_to_rest_stops_short_of_the_u_at_rest_by_what_is_uncertain() -> N
     rest, inverse, estimate = resting(std=0.01)
     model, x = StateModel(TransferFunction([0.1], [1.0, -1.9, 0.9])), [0.0, 0.0]
     plan = IdealTrajectory(design(model, TrackingWeights(10, 1e-2, 0.0)))
-    assert rest.decide(0.0, 1e-3, plan, x, 0.0, inverse.side, 0.0, False) is Mode.HOLD
+    assert rest.decide(0.0, 1e-3, plan, x, 0.0, inverse.side, lambda _: 0.0, False) is Mode.HOLD
     rest.step(estimate, plan, 0.0, inverse, begins=True)
     # From u = 1 down to 0, where c_l = -1 may lie 0.01 higher or lower.
     assert stepped(rest, inverse, estimate) == pytest.approx(-1.0 + SHORT * 0.01)

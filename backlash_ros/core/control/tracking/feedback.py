@@ -12,7 +12,7 @@ less it would leave to itself, as noise, until it is far away.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum, auto
 from math import hypot, inf, isnan, nan
@@ -24,7 +24,7 @@ from backlash_ros.core.control.structure import LARGEST_FEEDBACK, LARGEST_IN_ACQ
 from backlash_ros.core.control.tracking.design import SOFTEST, TrackingDesign, dot
 from backlash_ros.core.control.tracking.trajectory import IdealTrajectory
 from backlash_ros.core.estimate import Estimate, Status
-from backlash_ros.core.plant.backlash import Region
+from backlash_ros.core.plant.backlash import GAP, LEFT, RIGHT, Region
 from backlash_ros.core.plant.transfer_function import Array
 
 TRUSTED_AFTER = 40  # samples for which an estimate has to hold before it gets full feedback
@@ -273,7 +273,7 @@ class Rest:
 
     mode: Mode = Mode.HOLD
     target: tuple[float, float] = (0.0, 0.0)  # u_d where v rests, deviations to shrink its crossing
-    side: Region = Region.GAP  # newest line
+    side: Region = GAP  # newest line
     largest: float = 0.0  # |x*| so far
     limit: float = 0.0  # tolerance in use
     rested: int = 0  # samples for which the trajectory has
@@ -285,12 +285,13 @@ class Rest:
 
     def decide(
         self, y: float, noise_std: float, plan: IdealTrajectory, deviation: Sequence[float],
-        x_std: float | None, side: Region, pull: float, acts: bool,
+        x_std: float | None, side: Region, pull_back: Callable[[Sequence[float]], float],
+        acts: bool,
     ) -> Mode:
         """Set the mode for this sample.
 
-        x_std: of x_hat, None where it is unknown. side: line in use. pull: u - u* that brings y
-        back gently. acts: whether feedback asks for more than noise.
+        x_std: of x_hat, None where it is unknown. side: line in use. pull_back: u - u* that brings
+        y back gently. acts: whether feedback asks for more than noise.
         """
         self.largest = max(self.largest, hypot(*plan.x))
         least = 1e-5 * self.largest  # tolerance, where that is more
@@ -308,7 +309,8 @@ class Rest:
             self.limit = max(width * noise_std, least, UNCERTAIN * x_std)
             if self.mode is Mode.RETURN and side is not self.side:
                 self.turns += 1
-            self.mode = self._mode_at_rest(hypot(*deviation), len(plan.x), pull, acts)
+            size, pull = hypot(*deviation), pull_back(deviation)
+            self.mode = self._mode_at_rest(size, len(plan.x), pull, acts)
         self.side = side
         return self.mode
 
@@ -339,9 +341,9 @@ class Rest:
         begins: bool,
     ) -> None:
         """Aim v at where it is to rest, where that is better than to stay."""
-        if inverse.taking_up or inverse.side is Region.GAP:
+        if inverse.taking_up or inverse.side is GAP:
             return  # still on its way, or nobody knows what u is
-        ideal, engaged = plan.u, estimate.c_l if inverse.side is Region.LEFT else estimate.c_r
+        ideal, engaged = plan.u, estimate.c_l if inverse.side is LEFT else estimate.c_r
         u = estimate.m * (inverse.v - engaged)
         if self.mode is Mode.LEAD_BACK:
             if not begins and (u - ideal) * pull >= 0.5 * pull * pull:
@@ -356,7 +358,7 @@ class Rest:
                 return
             u_d, shrinkage = ideal, SHORT
         self.target = u_d, shrinkage
-        inverse.aim(u_d, Region.RIGHT if u_d > u else Region.LEFT)
+        inverse.aim(u_d, RIGHT if u_d > u else LEFT)
 
 
 def shrunk_crossings(estimate: Estimate, deviations: float, known: bool) -> tuple[float, float]:

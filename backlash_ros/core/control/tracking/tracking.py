@@ -14,7 +14,7 @@ from backlash_ros.core.control.tracking.trajectory import IdealTrajectory
 from backlash_ros.core.law import StateSource
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import TrackingWeights
-from backlash_ros.core.plant.backlash import Region
+from backlash_ros.core.plant.backlash import GAP, LEFT, RIGHT, Region
 from backlash_ros.core.plant.numerics import NoiseLevel
 from backlash_ros.core.plant.transfer_function import Array, StateModel
 
@@ -113,7 +113,7 @@ class Tracking(ControlStructure):
 
     def control(self, inputs: ControlInput, inverse: BacklashInverse) -> Command:
         """Return u_d and v = BI(u_d)."""
-        y_m, y, estimate, source, crossing = inputs
+        y_m, y, estimate, source, limits = inputs
         self.prepare()
         plan, feedback, rest, hand_over = self.trajectory, self.feedback, self.rest, self.hand_over
         first, x_cov = plan.references.empty, source.x_cov
@@ -129,10 +129,12 @@ class Tracking(ControlStructure):
             hand_over.due = inverse.extreme  # that led to v with the estimate before
         if hand_over.due is not None:
             stands_for = inverse.resume(feedback.trust.slope, *feedback.trust.crossings)
-            if inverse.side is not Region.GAP:
+            if inverse.side is not GAP:
                 hand_over.added += stands_for - hand_over.due
             hand_over.due = None
         deviation = feedback.deviation(source.x_hat, plan.x)
+        gap = estimate.c_r - estimate.c_l
+        crossing = max(gap / inverse.take_up, limits.samples_across(gap))
         turned = plan.turn(self._noise_std, feedback.gap_u, inverse.direction_band, crossing)
         correction, worth = feedback.u(
             deviation, inverse.limited or inverse.taking_up, rest.largest)
@@ -143,20 +145,21 @@ class Tracking(ControlStructure):
         added = hand_over.added
         hand_over.added *= FADING
         u_d += added
-        pull, before = feedback.pull_back(deviation), rest.mode
+        before = rest.mode
         mode = rest.decide(y, self._noise_std, plan, deviation,
-                           None if x_cov is None else feedback.noise.x_std, inverse.side, pull,
-                           abs(correction) > noise)
-        if mode.steps and mode is not before:
+                           None if x_cov is None else feedback.noise.x_std, inverse.side,
+                           feedback.pull_back, abs(correction) > noise)
+        steps = mode.steps
+        if steps and mode is not before:
             rest.target = inverse.extreme, 0.0  # stay where v is
-        if mode.steps and x_cov is not None:
-            rest.step(estimate, plan, pull, inverse, mode is not before)
+        if steps and x_cov is not None:
+            rest.step(estimate, plan, feedback.pull_back(deviation), inverse, mode is not before)
         side = self._side(turned, u_d, noise, inverse)
         # Whatever makes u_d: nothing leads it further from what the reference asks for.
         reach = feedback.bounds[1] + (abs(added) if hand_over.widens else 0.0)
-        u_d = min(max(rest.target[0] if mode.steps else u_d, plan.u - reach), plan.u + reach)
+        u_d = min(max(rest.target[0] if steps else u_d, plan.u - reach), plan.u + reach)
         side_before, v_before, trust = inverse.side, inverse.v, feedback.trust
-        if mode.steps:
+        if steps:
             shrunk = shrunk_crossings(estimate, rest.target[1], trust.known)
             v = inverse.proceed(trust.slope, *shrunk)
         else:
@@ -189,7 +192,7 @@ class Tracking(ControlStructure):
         # comes back across it, and has to be more than noise. What is not must not go further than
         # feedback agrees with either, but for what hands v over.
         plan, side, (c_r, c_l) = self.trajectory, inverse.side, self.feedback.trust.crossings
-        if side is Region.GAP or side is not plan.turning.side or c_r == c_l:
+        if side is GAP or side is not plan.turning.side or c_r == c_l:
             return worth
         held = inverse.held_u * side
         least, most = min(worth * side, held), max(plan.turning.furthest * side, held)
@@ -208,9 +211,9 @@ class Tracking(ControlStructure):
         """
         plan, side, (c_r, c_l) = self.trajectory, inverse.side, self.feedback.trust.crossings
         asked = plan.turning.side
-        if c_r == c_l and asked is not Region.GAP and u_d != inverse.held_u:
-            return Region.RIGHT if u_d > inverse.held_u else Region.LEFT  # nothing is crossed
-        if asked is Region.GAP or side is Region.GAP:
+        if c_r == c_l and asked is not GAP and u_d != inverse.held_u:
+            return RIGHT if u_d > inverse.held_u else LEFT  # nothing is crossed
+        if asked is GAP or side is GAP:
             return asked
         back = (inverse.held_u - u_d) * side
         if turned:

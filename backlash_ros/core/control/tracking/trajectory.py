@@ -12,7 +12,7 @@ from math import ceil, dist, inf, isnan, nan
 import numpy as np
 
 from backlash_ros.core.control.tracking.design import TrackingDesign, dot, parabolas
-from backlash_ros.core.plant.backlash import Region
+from backlash_ros.core.plant.backlash import GAP, RIGHT, Region
 from backlash_ros.core.plant.numerics import NoiseLevel
 from backlash_ros.core.plant.transfer_function import Array, powers
 
@@ -112,7 +112,7 @@ class ReferenceWindow:
 class Turning:
     """On which side u* moves, and where it turns."""
 
-    side: Region = Region.GAP  # on which u* moves
+    side: Region = GAP  # on which u* moves
     decided: int = 0  # samples for which it stays
     extreme: float = nan  # furthest u* on it
     furthest: float = nan  # u* to which u goes without turning
@@ -142,7 +142,7 @@ class IdealTrajectory:
     def aim(self) -> float:
         """u* of this sample, or what it comes back to without having turned."""
         side, furthest = self.turning.side, self.turning.furthest
-        return furthest if side is not Region.GAP and (self.u - furthest) * side > 0.0 else self.u
+        return furthest if side is not GAP and (self.u - furthest) * side > 0.0 else self.u
 
     @property
     def back(self) -> float:
@@ -159,7 +159,7 @@ class IdealTrajectory:
         """Be this one of the trajectories of a design from the next sample on."""
         self.design, self.softness, self._plan = design, softness, design.plans[softness]
         self.references.noise_gains = self._plan.noise_gains
-        self._due: list[float] | None = None  # u* ahead at the next sample, but for its reference
+        self._due: Array | None = None  # u* ahead at the next sample, but for its reference
         self._transition: list[tuple[list[float], float]] = list(
             zip(design.model.a.tolist(), design.model.b.tolist(), strict=True))
 
@@ -198,7 +198,7 @@ class IdealTrajectory:
         z = np.linalg.matrix_power(plan.closed, steps) @ start + np.einsum(
             'kij,kj->i', powers(plan.closed, inputs, steps), pairs)
         self.x, self.q = z[:n].tolist(), float(z[n])
-        self.ahead = self._ahead(self.references.window)
+        self.ahead = self._ahead(self.references.window).tolist()
 
     def begin(self, r: float) -> None:
         """Rest at y = r."""
@@ -213,11 +213,11 @@ class IdealTrajectory:
 
     def take(self, y_m: float) -> None:
         """Take in r(k + N), so that u* is known for this sample and those ahead."""
-        references, r, gains = self.references, float(y_m), self._plan.references[:, -1].tolist()
-        due = self._due or self._ahead(references.window[1:])
+        references, r, gains = self.references, float(y_m), self._plan.references[:, -1]
+        due = self._ahead(references.window[1:]) if self._due is None else self._due
         references.append(r)
         self.spread = max(references.high, r) - min(references.low, r) - references.noise_spread
-        self.ahead = [u + gain * r for u, gain in zip(due, gains, strict=True)]
+        self.ahead = (due + gains * r).tolist()
 
     def turn(self, noise_std: float, gap_u: float, band: float, crossing: float) -> bool:
         """Decide on which side v is to be at this sample; returns whether it is another one.
@@ -235,7 +235,7 @@ class IdealTrajectory:
         noise = max(least, self.noise_band)
         if turning.decided > 0:
             turning.decided -= 1
-        elif before is Region.GAP:
+        elif before is GAP:
             moves = [u - turning.extreme for u in ahead]
             if max(map(abs, moves[:arrival + 1])) > least:
                 first = next((move for move in moves if abs(move) > noise), 0.0)
@@ -250,7 +250,7 @@ class IdealTrajectory:
         if (ahead[0] - turning.extreme) * turning.side > 0.0 and not turning.decided:
             turning.extreme = ahead[0]
         turning.turns_in = turns_in if turning.side is before else 0
-        most, least_of = (max, min) if turning.side is Region.RIGHT else (min, max)
+        most, least_of = (max, min) if turning.side is RIGHT else (min, max)
         turning.furthest = most(ahead)
         if turning.turns_in == len(ahead) \
                 and least_of(ahead[ahead.index(turning.furthest):]) != ahead[-1]:
@@ -277,10 +277,10 @@ class IdealTrajectory:
         self.references.settle()
         self._due = self._ahead(self.references.window[1:])
 
-    def _ahead(self, references: Array) -> list[float]:
+    def _ahead(self, references: Array) -> Array:
         """u* from [x*; q*] and these references on, as many as there are."""
         gains = self._plan.references[:, :len(references)]
-        ahead: list[float] = (self._plan.states @ [*self.x, self.q] + gains @ references).tolist()
+        ahead: Array = self._plan.states @ [*self.x, self.q] + gains @ references
         return ahead
 
 
