@@ -30,9 +30,9 @@ from backlash_ros.nodes.control.joint import Joint, offer_services
 from backlash_ros.nodes.control.publishing import StepPublisher
 from backlash_ros.nodes.control.rivals import RivalWatch
 from backlash_ros.nodes.runtime.driver_io import DriverIo, check_style
-from backlash_ros.nodes.runtime.executor import refuse_unfit_transitions
+from backlash_ros.nodes.runtime.executor import PromptExecutor, refuse_unfit_transitions
 from backlash_ros.nodes.runtime.messages import DEPTH, DIAGNOSTICS_PERIOD_S, KEPT_QOS, line_of
-from backlash_ros.nodes.runtime.process import ProcessNode, run
+from backlash_ros.nodes.runtime.process import ProcessNode, emit, run
 
 
 class ControllerNode(LifecycleNodeMixin, ProcessNode):
@@ -143,17 +143,27 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         self.active = True
         self._rivals.follow(active=True)
-        if self._io.topics.output in self._io.heard:
-            # v goes on from the last command, but what the plant did meanwhile is unknown, and
-            # that nobody was listened to is no silence of the driver.
-            for loop in self.loops.loops:
+        for loop in self.loops.loops:
+            # That nobody was listened to is no silence of the driver. v goes on from the last
+            # command, but what the plant did meanwhile is unknown.
+            loop.heard.y_at = nan
+            if loop.statistics.used:
                 loop.renew(loop.estimate)
-                loop.heard.y_at = nan
-        else:
-            to = self._io.topics
-            self.start_when(self._are_all_there, self._listen,
-                           f'{to.reference} and the listeners of {to.control}')
         return TransitionCallbackReturn.SUCCESS
+
+    def work(self, executor: PromptExecutor) -> None:
+        to = self._io.topics
+        while not (self.active or self.stopping):
+            executor.spin_once()
+        if self.wait_until(executor, self._are_all_there,
+                           f'{to.reference} and the listeners of {to.control}'):
+            self._rivals.look()
+            self._steps.look()
+            # This starts the loop.
+            kept = sample_counter.kept_outputs(self.settings.sample_period)
+            self._io.listen(self._on_output, min(kept, DEPTH))
+            emit('ready')
+        super().work(executor)
 
     def _are_all_there(self) -> bool:
         """Whether everybody is found that may be there: beside the driver those who hear it all."""
@@ -165,15 +175,6 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
             and (self.count_publishers(io.topics.reference) > 0 if lockstep
                  else all(isfinite(loop.heard.y_m_at) for loop in self.loops.loops))
         ))
-
-    def _listen(self) -> None:
-        """Listen to plant_output, which starts the loop."""
-        # Whoever is activated twice before everybody is there has two that wait.
-        if self._io.topics.output not in self._io.heard:
-            self._rivals.look()
-            self._steps.look()
-            kept = sample_counter.kept_outputs(self.settings.sample_period)
-            self._io.listen(self._on_output, min(kept, DEPTH))
 
     def on_deactivate(self, state: LifecycleState | None) -> TransitionCallbackReturn:
         if self.active:

@@ -49,10 +49,9 @@ class PlantNode(ProcessNode):
             self, topics.of_node(topics.TRUTH), topics.TRUTH_LABELS
         )
         self.listen(Float64, topics.CONTROL, self._on_control, 1)
-        name, start = self.resolve_topic_name, self._answer if p.lockstep else lambda: None
+        name = self.resolve_topic_name
         self.log.info(f'started: {name(topics.CONTROL)} in, {name(topics.PLANT_OUTPUT)} out, '
                       f'sample_period {p.sample_period:g} s')
-        self.start_when(self._is_heard, start, f'subscribers of {topics.PLANT_OUTPUT}')
 
     def _is_heard(self) -> bool:
         """Whether enough listen; one of several is a recorder, which wants everything."""
@@ -67,10 +66,12 @@ class PlantNode(ProcessNode):
         self._plant.change(self.settings)
 
     def work(self, executor: PromptExecutor) -> None:
-        while not (self.started or self.stopping):
-            executor.spin_once()
-        if not self.settings.lockstep:
-            self._keep_time(executor)
+        if self.wait_until(executor, self._is_heard, f'subscribers of {topics.PLANT_OUTPUT}'):
+            emit('ready')
+            if self.settings.lockstep:
+                self._answer()
+            else:
+                self._keep_time(executor)
         super().work(executor)
 
     def finish(self) -> None:

@@ -77,18 +77,17 @@ class RecorderNode(ProcessNode):
             self.create_subscription(Clock, topics.CLOCK, self._on_clock, RECORDER_DEPTH)
         if ENABLED:
             self.every(0.2, self._tell)
+
+    def work(self, executor: PromptExecutor) -> None:
+        p, to = self.settings, driver_topics(self.settings)
         # Lockstep promises every row: that of the first truth leaves as soon as y is subscribed to.
         truth = (topics.TRUTH,) if p.lockstep else ()
         wanted = (topics.ESTIMATES, topics.SIGNALS, *truth, to.reference, to.control)
-        self.start_when(
-            lambda: not p.wait_for_publishers or all(
-                self._channels[topic].subscription.get_publisher_count() for topic in wanted
-            ),
-            lambda: self._record(to.output, to.types[to.output], output_qos(p, RECORDER_DEPTH)),
-            ', '.join(wanted),
-        )
-
-    def work(self, executor: PromptExecutor) -> None:
+        if self.wait_until(executor, lambda: not p.wait_for_publishers or all(
+            self._channels[topic].subscription.get_publisher_count() for topic in wanted
+        ), ', '.join(wanted)):
+            self._record(to.output, to.types[to.output], output_qos(p, RECORDER_DEPTH))
+            emit('ready')
         super().work(executor)
         # What has arrived belongs into the bag; a signal has to end it within a second.
         deadline = time.monotonic() + 0.3

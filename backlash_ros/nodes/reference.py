@@ -19,7 +19,7 @@ from backlash_ros.core.scenario import PERIODIC, build_reference
 from backlash_ros.nodes.runtime import messages
 from backlash_ros.nodes.runtime.driver_io import DriverIo
 from backlash_ros.nodes.runtime.executor import PromptExecutor, serve_polled
-from backlash_ros.nodes.runtime.process import ProcessNode, run
+from backlash_ros.nodes.runtime.process import ProcessNode, emit, run
 
 
 class ReferenceNode(ProcessNode):
@@ -43,20 +43,17 @@ class ReferenceNode(ProcessNode):
         name = self.resolve_topic_name
         self.log.info(f'started: {name(self._io.topics.output)} in, {name(topics.REFERENCE)} out: '
                       f'{p.waveform}, sample_period {p.sample_period:g} s')
-        self.start_when(
-            lambda: self._output.get_subscription_count() >= p.wait_for_subscribers,
-            lambda: p.lockstep and self.create_subscription(
-                Clock, topics.CLOCK, self._on_clock, messages.KEPT_QOS
-            ), f'{p.wait_for_subscribers} subscribers of {topics.REFERENCE}',
-        )
 
     def work(self, executor: PromptExecutor) -> None:
-        while not (self.started or self.stopping):
-            executor.spin_once()
-        if self.settings.lockstep:
-            super().work(executor)
-        else:
-            self._follow(executor)
+        wanted = self.settings.wait_for_subscribers
+        if self.wait_until(executor, lambda: self._output.get_subscription_count() >= wanted,
+                           f'{wanted} subscribers of {topics.REFERENCE}'):
+            if self.settings.lockstep:
+                self.create_subscription(Clock, topics.CLOCK, self._on_clock, messages.KEPT_QOS)
+            emit('ready')
+            if not self.settings.lockstep:
+                self._follow(executor)
+        super().work(executor)
 
     def _follow(self, executor: PromptExecutor) -> None:
         """Publish y_m half a period after each output, by the own clock where none comes.

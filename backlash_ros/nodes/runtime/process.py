@@ -88,7 +88,7 @@ class ProcessNode(Node):
         self.log = Node.get_logger(self)
         self.declare_settings(parameters_of or executable)
         self.signals: list[int] = []
-        self.exit_code, self.started = DONE, False
+        self.exit_code = DONE
 
     def check_change(self, p: Parameters) -> None:
         """Raise ParameterError for values that the node cannot take up."""
@@ -124,24 +124,17 @@ class ProcessNode(Node):
     def finish(self) -> None:
         """Say what there is to say at the end; called once, whatever ended the work."""
 
-    def start_when(
-        self, condition: Callable[[], bool], action: Callable[[], object], awaited: str,
-    ) -> None:
-        """Call action when condition holds: the node is ready then. awaited: for the log."""
+    def wait_until(
+        self, executor: PromptExecutor, condition: Callable[[], object], awaited: str,
+    ) -> bool:
+        """Work until condition holds; returns whether it does. awaited: for the log."""
         remind = time.monotonic() + 5.0
-
-        def look() -> None:
-            nonlocal remind
-            if condition():
-                self.destroy_timer(timer)
-                action()
-                self.started = True
-                emit('ready')
-            elif time.monotonic() > remind:
+        while not (self.stopping or condition()):
+            executor.spin_once(timeout_sec=0.01)
+            if time.monotonic() > remind:
                 remind += 5.0
                 self.log.info(f'waiting for {awaited}')
-
-        timer = self.every(0.01, look)
+        return not self.stopping
 
     def declare_settings(self, executable: str) -> None:
         """Declare what the table says of this executable; raises ParameterError."""
