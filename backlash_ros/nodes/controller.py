@@ -82,8 +82,7 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
             to.reference, self._on_reference, KEPT_QOS if p.lockstep else 1, polled=not p.lockstep,
         )
         self.joints = [
-            Joint(self, name, p.of_joint(name), self._io, loop)
-            for name, loop in self.loops.by_name.items()
+            Joint(self, name, self._io, loop) for name, loop in self.loops.by_name.items()
         ]
         offer_services(self, self.joints)
         turns = cycle(self.joints)
@@ -286,7 +285,6 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
     def take_up(self, before: Parameters) -> None:
         p = self.settings
         for joint in self.joints:
-            joint.p = p.of_joint(joint.name)
             if self.configured:
                 joint.loop.take_up(joint.p)
         if p.sample_period != before.sample_period:

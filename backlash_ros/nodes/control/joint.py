@@ -32,20 +32,22 @@ class Joint:
     /diagnostics has. saved_at: when estimates were saved last, on the steady clock [s].
     """
 
-    def __init__(
-        self, node: ProcessNode, name: str, p: Parameters, io: DriverIo, loop: ControlLoop,
-    ) -> None:
-        self.name, self.p, self.loop = name, p, loop
+    def __init__(self, node: ProcessNode, name: str, io: DriverIo, loop: ControlLoop) -> None:
+        self.name, self.loop = name, loop
         self.model = ModelPublisher(node, name)
         self._node, self._io = node, io
         self.told: object = None
         self._lately = Lately()
         self._diagnostics = DiagnosticsPublisher(
-            node, p.io.joint or io.publisher.topic_name, part=name
+            node, node.settings.of_joint(name).io.joint or io.publisher.topic_name, part=name
         )
         # A disk that is slow to confirm a file would cost samples; one writing follows the other.
         self._writer = futures.ThreadPoolExecutor(1, thread_name_prefix='estimates')
         self.saved_at = time.monotonic()
+
+    @property
+    def p(self) -> Parameters:
+        return self._node.settings.of_joint(self.name)
 
     @property
     def state(self) -> object:

@@ -19,8 +19,6 @@ from backlash_ros.core.plant.transfer_function import StateModel
 from backlash_ros.core.simulation.run_record import learned_model_of, stated_deviations
 from backlash_ros.nodes.runtime.messages import NO_EVENTS, LabelledArrayPublisher
 
-Row = tuple[float, ...]
-
 
 class WatchPublisher:
     """Publishes `controller/watch/[<joint>/]<label>` for each label that is subscribed to.
@@ -46,30 +44,15 @@ class WatchPublisher:
             if publisher.get_subscription_count()
         ]
 
-    def follow(self, signals: Row, estimates: Row) -> None:
-        """Publish what is due of a sample, given by its rows in the order of their labels."""
-        now_s = time.monotonic()
-        due = now_s > self._due_s
-        if not (self.heard and (due or self._u_waits)):
-            return
-        values = watched_values(signals, estimates)
+    def follow(self, values: Mapping[str, float]) -> None:
+        """Publish what is due of a sample."""
+        due = time.monotonic() > self._due_s
         for label in self.heard:
             if self._u_waits if label == 'u_hat' else due:
                 self._publishers[label].publish(Float64(data=values[label]))
         self._u_waits = due
         if due:
-            self._due_s = now_s + self.PAUSE_S
-
-
-def watched_values(signals: Row, estimates: Row) -> dict[str, float]:
-    """The value of each of WATCH_LABELS, nan for bands where the law has no deviations."""
-    estimate = dict(zip(topics.ESTIMATE_LABELS, estimates, strict=True))
-    values = dict(zip(topics.SIGNAL_LABELS, signals, strict=True))
-    del values['sample']
-    for name in topics.BACKLASH:
-        value, half = estimate[name], 2.0 * estimate[f'std_{name}']
-        values |= {name: value, f'{name}_low': value - half, f'{name}_high': value + half}
-    return values | {'gap': estimate['c_r'] - estimate['c_l']}
+            self._due_s = time.monotonic() + self.PAUSE_S
 
 
 class StepPublisher:
@@ -82,42 +65,51 @@ class StepPublisher:
     heard = True
 
     def __init__(self, node: Node, joints: Sequence[str]) -> None:
-        self._rows = [
-            LabelledArrayPublisher(node, topics.of_node(topic), [
+        self._arrays = {
+            topic: LabelledArrayPublisher(node, topics.of_node(topic), [
                 topics.of_joint(label, joint) for joint in joints
                 for label in topics.LABELS_OF[topic]
             ]) for topic in (topics.SIGNALS, topics.ESTIMATES)
-        ]
+        }
         self._watches = {joint: WatchPublisher(node, joint) for joint in joints}
         self._turns = cycle(self._watches.values())
 
     @property
     def listeners(self) -> int:
-        return min(publisher.listeners for publisher in self._rows)
+        return min(publisher.listeners for publisher in self._arrays.values())
 
     def look(self) -> None:
         """Look who listens; to ask at every sample would take a tenth of it."""
         next(self._turns).look()
-        self.heard = any(publisher.listeners for publisher in self._rows) \
+        self.heard = any(publisher.listeners for publisher in self._arrays.values()) \
             or any(watch.heard for watch in self._watches.values())
 
     def publish(self, loops: Mapping[str, ControlLoop], steps: Mapping[str, ControlStep]) -> None:
         if self.heard:
-            rows = {joint: _rows(loop, steps.get(joint)) for joint, loop in loops.items()}
-            for publisher, row in zip(self._rows, zip(*rows.values(), strict=True), strict=True):
-                publisher.publish([*chain(*row)])
-            for joint in steps:
-                self._watches[joint].follow(*rows[joint])
+            values = {joint: labelled(loops[joint], step) for joint, step in steps.items()}
+            for topic, publisher in self._arrays.items():
+                publisher.publish([
+                    values[joint][label] if joint in values else nan
+                    for joint in loops for label in topics.LABELS_OF[topic]
+                ])
+            for joint, of_joint in values.items():
+                self._watches[joint].follow(of_joint)
 
 
-def _rows(loop: ControlLoop, step: ControlStep | None) -> tuple[Row, Row]:
-    if step is None:
-        return (nan,) * len(topics.SIGNAL_LABELS), (nan,) * len(topics.ESTIMATE_LABELS)
-    e, sample, law = step.estimate, float(loop.counter.index), loop.core.estimator
-    return (
-        step.y_m, step.y, step.u_d, step.v, law.u_hat, law.innovation, float(e.status), sample,
-        loop.statistics.latencies[-1],
-    ), (e.m, e.c_r, e.c_l, e.f, *stated_deviations(e), nan, sample)
+def labelled(loop: ControlLoop, step: ControlStep) -> dict[str, float]:
+    """What SIGNAL_LABELS, ESTIMATE_LABELS and WATCH_LABELS name, of the newest sample."""
+    e, law = step.estimate, loop.core.estimator
+    values = {
+        'y_m': step.y_m, 'y': step.y, 'u_d': step.u_d, 'v': step.v, 'u_hat': law.u_hat,
+        'innovation': law.innovation, 'status': float(e.status),
+        'sample': float(loop.counter.index), 'latency_s': loop.statistics.latencies[-1],
+        'f': e.f, 'std_f': nan, 'gap': e.c_r - e.c_l,
+    }
+    backlash = zip(topics.BACKLASH, (e.m, e.c_r, e.c_l), stated_deviations(e), strict=True)
+    for name, value, std in backlash:
+        values[name], values[f'std_{name}'] = value, std
+        values[f'{name}_low'], values[f'{name}_high'] = value - 2.0 * std, value + 2.0 * std
+    return values
 
 
 class ModelPublisher:

@@ -5,7 +5,7 @@ from array import array
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, cached_property
 from math import nan
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
@@ -20,18 +20,9 @@ from backlash_ros.core.loop.control_loop import Driver
 from backlash_ros.core.loop.sample_counter import Output, Timing
 from backlash_ros.core.loop.wall_clock import WallClock
 from backlash_ros.core.parameters import ParameterError, Parameters
+from backlash_ros.nodes.runtime import messages
 from backlash_ros.nodes.runtime.executor import serve_polled
-from backlash_ros.nodes.runtime.messages import (
-    DEPTH,
-    JointMessage,
-    JointReader,
-    joint_message,
-    line_of,
-    message_with,
-    name_of,
-    name_of_type,
-    number_of,
-)
+from backlash_ros.nodes.runtime.messages import DEPTH, JointMessage, line_of, name_of
 from backlash_ros.nodes.runtime.process import ProcessNode
 
 
@@ -93,6 +84,7 @@ class DriverIo:
 
     def __init__(self, node: ProcessNode, p: Parameters) -> None:
         self.topics = driver_topics(p)
+        self._names = {joint: joint or p.io.joint for joint in p.joint_names}  # in messages
         self.skipped, self.seen = dict.fromkeys(p.joint_names, 0), ''
         self._node, self._p = node, p
         self._stamp = 0, 0  # in the header of the newest y, and the number of its message
@@ -143,7 +135,8 @@ class DriverIo:
     ) -> Subscription:
         """Call hear with every y. polled: when serve_polled is called."""
         def hear_output(
-            values: dict[str, float], info: dict[str, Any], message: float | JointMessage,
+            values: dict[str, float], info: dict[str, Any],
+            message: tuple[float, ...] | JointMessage,
         ) -> None:
             stamp_ns, number = 0, info['publication_sequence_number']
             of_joints = isinstance(message, JointMessage)
@@ -178,7 +171,7 @@ class DriverIo:
         """Call hear with values by joint, info, and content. polled: in serve_waiting."""
         kind = self.topics.types[topic]
         readers: dict[type[Any], Callable[[bytes], Any]] = {
-            Float64: number_of, JointState: JointReader().read,
+            Float64: messages.numbers_of, JointState: messages.JointReader().read,
             Float64MultiArray: lambda content: deserialize_message(content, Float64MultiArray).data,
         }
         read, refers = readers[kind], kind is JointState and topic == self.topics.reference
@@ -202,18 +195,16 @@ class DriverIo:
         for topic in (self.topics.reference, self.topics.applied):
             serve_polled(self.heard[topic])
 
-    def values(self, message: float | Sequence[float] | JointMessage) -> dict[str, float]:
+    def values(self, message: Sequence[float] | JointMessage) -> dict[str, float]:
         """What a message says about the joints of this node, by their names."""
-        names, own = self._p.joint_names, self._p.io.joint
-        if isinstance(message, float):
-            return {'': message}
-        if not isinstance(message, JointMessage):
-            return dict(zip(names, message, strict=True)) if len(message) == len(names) else {}
-        values = getattr(message, self._p.io.field)
-        if names == ('',) and not own:
-            return {'': values[0]} if len(values) == 1 else {}
-        found = dict(zip(message.name, values, strict=False))
-        return {joint: found[joint or own] for joint in names if (joint or own) in found}
+        names, values = self._names, cast(Sequence[float], message)
+        if isinstance(message, JointMessage):
+            values = getattr(message, self._p.io.field)
+            if any(names.values()):
+                found = dict(zip(message.name, values, strict=False))
+                return {joint: found[name] for joint, name in names.items() if name in found}
+        # Without names, values are in the order of the joints.
+        return dict(zip(names, values, strict=True)) if len(values) == len(names) else {}
 
     def advertise(self) -> None:
         topic = self.topics.control
@@ -225,17 +216,17 @@ class DriverIo:
         if kind is Float64MultiArray:
             self._newest.update(commands)
             if len(self._newest) == len(self.skipped):
-                data = array('d', map(self._newest.__getitem__, self._p.joint_names))
+                data = array('d', map(self._newest.__getitem__, self._names))
                 self.publisher.publish(Float64MultiArray(data=data))
             return
         # What rclpy would do after it has found out that these are bytes.
         self.publisher.handle.publish_raw(
-            message_with(commands['']) if kind is Float64
-            else joint_message(self._joint_state(commands)))
+            messages.message_with(commands['']) if kind is Float64
+            else messages.joint_message(self._joint_state(commands)))
 
     def _joint_state(self, commands: Mapping[str, float]) -> JointMessage:
         """v, and what the newest reference says of the joints besides."""
-        names = tuple(joint or self._p.io.joint for joint in commands)
+        names = tuple(map(self._names.__getitem__, commands))
         row, fields = {name: i for i, name in enumerate(self._referred.name)}, {}
         for field in ('position', 'velocity', 'effort'):
             passed = getattr(self._referred, field)
@@ -270,7 +261,7 @@ class DriverIo:
 
 def _misfit(sent: str, kind: type[Any], offers: QoSProfile, wants: QoSProfile) -> str:
     """Why no message passes, as diagnosis.Peer says it."""
-    if sent != name_of_type(kind):
+    if sent != messages.name_of_type(kind):
         return 'type'
     if qos_check_compatible(offers, wants)[0] != QoSCompatibility.ERROR:
         return ''

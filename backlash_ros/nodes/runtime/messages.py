@@ -121,10 +121,9 @@ def arrival_ns(received_ns: int) -> int:
     return time.monotonic_ns() - max(time.time_ns() - received_ns, 0)
 
 
-def number_of(message: bytes) -> float:
-    """What a std_msgs/Float64 holds."""
-    number: float = (CDR_FLOAT64 if message[1] & 1 else Struct('>xBxxd')).unpack_from(message)[1]
-    return number
+def numbers_of(message: bytes) -> tuple[float, ...]:
+    """The only number that a std_msgs/Float64 holds."""
+    return (CDR_FLOAT64 if message[1] & 1 else Struct('>xBxxd')).unpack_from(message)[1:]
 
 
 def message_with(number: float) -> bytes:

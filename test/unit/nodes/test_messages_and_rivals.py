@@ -14,8 +14,11 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
+from backlash_ros.core import Estimate, Parameters, Status
+from backlash_ros.core.loop.control_loop import ControlLoop, Driver
+from backlash_ros.core.loop.sample_counter import Output, SampleCounter
 from backlash_ros.middleware import PROFILE, prefer_loopback
-from backlash_ros.nodes.control.publishing import watched_values
+from backlash_ros.nodes.control.publishing import labelled
 from backlash_ros.nodes.control.rivals import ENDPOINT, SINCE, CommandLock, Rival, Rivals
 from backlash_ros.nodes.runtime import messages
 from backlash_ros.nodes.runtime.process import unreached
@@ -48,9 +51,9 @@ def test_a_profile_of_the_user_stays(tmp_path: Path, monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize('number', [0.0, -1.5, 1e-300, 12.345678901234567, inf, -inf, nan])
 def test_a_number_goes_out_and_comes_in_as_a_float64(number: float) -> None:
     assert repr(deserialize_message(messages.message_with(number), Float64).data) == repr(number)
-    assert repr(messages.number_of(serialize_message(Float64(data=number)))) == repr(number)
+    assert repr(messages.numbers_of(serialize_message(Float64(data=number)))) == repr((number,))
     of_highest_byte_first = b'\x00\x00\x00\x00' + struct.pack('>d', number)
-    assert repr(messages.number_of(of_highest_byte_first)) == repr(number)
+    assert repr(messages.numbers_of(of_highest_byte_first)) == repr((number,))
 
 
 def test_an_error_is_told_to_who_started_the_node(monkeypatch):
@@ -106,18 +109,18 @@ def test_sections_that_do_not_reach_their_node_are_named(sections, full_name, re
     assert said == '' if reached else f'{sections[0].strip("/")} is not for {full_name}' in said
 
 
-SIGNALS = tuple(float(i) for i, _ in enumerate(topics.SIGNAL_LABELS))
-ESTIMATES = (1.3, 3.0, -2.0, 0.2, 0.1, 0.2, 0.3, nan, 7.0)
-
-
-def test_values_are_those_of_the_rows_with_bands_of_two_deviations() -> None:
-    values = watched_values(SIGNALS, ESTIMATES)
-    assert set(values) == set(topics.WATCH_LABELS)
+def test_a_sample_has_a_value_of_every_label_and_bands_of_two_deviations() -> None:
+    p = Parameters()
+    loop = ControlLoop(p, lambda v: None, Driver(lambda: 0), None, SampleCounter(p.sample_period))
+    made = loop.answer(Output(0.5, 0, 0, 0, 0), y_m=1.0)
+    assert made is not None
+    e = Estimate(1.3, 3.0, -2.0, 0.2, 0.05, 0.1, 0.3, Status.TRACKING)
+    values = labelled(loop, made._replace(estimate=e))
+    assert {*topics.SIGNAL_LABELS, *topics.ESTIMATE_LABELS, *topics.WATCH_LABELS} == set(values)
     assert (values['m'], values['c_r'], values['c_l'], values['gap']) == (1.3, 3.0, -2.0, 5.0)
-    assert (values['m_low'], values['m_high']) == pytest.approx((1.1, 1.5))
+    assert (values['m_low'], values['m_high']) == pytest.approx((1.2, 1.4))
     assert (values['c_l_low'], values['c_l_high']) == pytest.approx((-2.6, -1.4))
-    for label in ('y_m', 'y', 'u_d', 'v', 'u_hat', 'innovation', 'status', 'latency_s'):
-        assert values[label] == SIGNALS[topics.SIGNAL_LABELS.index(label)]
+    assert (values['y_m'], values['y'], values['v'], values['sample']) == (1.0, 0.5, made.v, 0.0)
 
 
 def rivals_of(own: str = 'b', active_at: float = 10.0, since_ns: int = 100) -> Rivals:
