@@ -199,10 +199,10 @@ class Problem:
             delayed(impulse, len(run.a) - 1), lfilter(run.b, [1.0], over_a[:-3]),
             sensitivities(self.family, f.xi, u, y)]).T
 
-    def fitted(self, f: WindowFit, steps: int = STEPS) -> WindowFit:
+    def fitted(self, f: WindowFit, steps: int = STEPS, least_gain: float = 0.0) -> WindowFit:
         """Gauss-Newton steps from f until they move nothing, halved where they go too far."""
         far_steps = 4  # the first of them, over which G is no further off than configured
-        # Deviations of the gap that a step may still move it by at the end.
+        # Deviations of the gap that a step may still move it by; least_gain: of the log-likelihood.
         least_move = 0.02 if steps > FEW_STEPS else 0.2
         for k in range(steps):
             weights = self.at(f).weights
@@ -226,7 +226,7 @@ class Problem:
                 continue
             moved = abs(there.gap - f.gap) / max(sqrt(max(new.cov[2, 2], 0.0)), 1e-300)
             f = there if there.step else replace(there, noise_std=self._noise_of(there))
-            if moved < least_move and value - best < 1.0:
+            if value - best < (1.0 if moved < least_move else least_gain):
                 break
         return f
 
@@ -261,8 +261,8 @@ class Problem:
     def _noise_of(self, f: WindowFit) -> float:
         run = self.at(f)
         free = max(float(run.weights.sum()) - len(f.x) - len(f.knots) - 4.0, 0.0)
-        squares = float((run.weights * run.error) @ run.error)
-        return sqrt((squares + self.nominal**2) / (free + 1.0))
+        squares = (run.weights * run.error) @ run.error + self.nominal**2
+        return sqrt(squares / (free + 1.0))
 
     def finished(self, f: WindowFit) -> WindowFit:
         """The same with what it leaves."""

@@ -146,8 +146,9 @@ def state_columns(a: list[float], count: int) -> Array:
 
 def sensitivities(family: Family, xi: list[float], u: Array, y: Array) -> Array:
     """Derivatives of y by each xi, (..., K, N); u, y: input and output over A, (..., N)."""
-    of_b, of_a = family.slopes(xi)
-    return np.asarray(of_b @ delayed(u, of_b.shape[1]) - of_a @ delayed(y, of_a.shape[1]))
+    each = [lfilter(b, [1.0], u) - lfilter(a, [1.0], y)
+            for b, a in zip(*map(np.ndarray.tolist, family.slopes(xi)), strict=True)]
+    return np.moveaxis(np.reshape(each, (-1, *u.shape)), 0, -2)
 
 
 def _sections(poles: NDArray[np.complex128]) -> tuple[int, list[float]]:

@@ -34,7 +34,7 @@ def search(
 
     v, y: (N,), y nan where lost. widest: gap that is considered. xi: error of G (K,), around which
     G is linearized. near: gap around which more are compared, 0 for none. smallest: gap that is
-    compared, over the swing of v.
+    compared, over the largest: the swing of v, or the widest.
     """
     known, begins, (b, a) = np.isfinite(y), _bins(v), family.at(xi.tolist())
     readings = np.add.reduceat(known.astype(np.float64), begins)
@@ -92,9 +92,8 @@ def search(
         best = evidence.reshape(len(gaps), -1).argmax(axis=1) + np.arange(0, len(g), len(shares))
         return [Hypothesis(*one) for one in np.column_stack([evidence, g, p0, m])[best].tolist()]
 
-    swing = float(np.ptp(v))
-    top = min(swing, widest)
-    gaps: Array = np.append(1e-9 * swing, np.geomspace(smallest * min(swing, top), top, 32))
+    top = min(float(np.ptp(v)), widest)
+    gaps: Array = np.append(1e-9 * top, np.geomspace(smallest * top, top, 32))
     if near > 0.0:
         gaps = np.unique([*gaps, *np.minimum(np.geomspace(0.8, 1.25, 33) * near, top)])
     # The first is none at all. Of so many at once that memory holds them.

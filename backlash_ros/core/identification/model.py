@@ -177,17 +177,18 @@ class Model:
 
 def fitted(
     samples: Samples, structure: Structure, *begins: WindowFit, steps: int = STEPS,
+    least_gain: float = 0.0,
 ) -> Model:
-    """The best of the values nearest to some."""
-    found = []
-    for begin in begins:
+    """The values nearest to the one of these that leaves least after two steps."""
+    def after(steps: int, begin: WindowFit) -> Model:
         problem = samples.problem(structure)
         # As much noise as there is motion hides nothing from the first step.
         fit = replace(begin, step=0.0, noise_std=max(begin.noise_std, 1e-12))
         with suppress(np.linalg.LinAlgError):  # what has no finite posterior stays as it began
-            fit = problem.fitted(fit, steps)
-        found.append(Model(structure, problem, fit))
-    return min(found)
+            fit = problem.fitted(fit, steps, least_gain)
+        return Model(structure, problem, fit)
+
+    return min(after(steps, one) for one in begins)
 
 
 def steiglitz_mcbride(

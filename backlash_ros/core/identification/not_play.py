@@ -8,7 +8,6 @@ by the residual of the fit. Tests return a sentence, empty where they find nothi
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from math import copysign
 from typing import NamedTuple
 
 import numpy as np
@@ -196,9 +195,10 @@ def coasting(v: Array, width: float, dry: float, viscous: float) -> Array:
     half, dry, kept = 0.5 * abs(width), abs(dry), 1.0 - min(abs(viscous), 1.0)
     place, speed, out = float(v[0]), 0.0, []
     for value in v.tolist():
-        speed = copysign(max(kept * abs(speed) - dry, 0.0), speed)
-        on = min(max(place + speed, value - half), value + half)
-        if on != place + speed:
+        speed = max(kept * speed - dry, 0.0) if speed > 0.0 else min(kept * speed + dry, 0.0)
+        free, low, high = place + speed, value - half, value + half
+        on = low if free < low else high if free > high else free
+        if on != free:
             speed = on - place
         place = on
         out.append(place)

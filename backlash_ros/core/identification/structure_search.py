@@ -39,6 +39,8 @@ Progress = Callable[[str], object]
 EARLY, LONGEST_DELAY = (0, 1, 2, 3), 40  # delays that are compared first, and the longest
 GENERAL_POLES = 3  # of the G with which the gap is searched first; it has a tap for each delay
 HELD_OUT = 1.0 / 3.0  # share of the record, its last
+ALIKE = 0.1  # of the log-likelihood, by which no structure is better than another
+HOPELESS = 1.5  # squares over the least, beyond which a fit is not completed
 PLATEAU = 10.0  # difference of the criterion below which two delays are equally good
 EXACT = 1e-10  # rms over that of y, less than which no error counts: simulations round
 
@@ -104,13 +106,14 @@ def searched(
     kept = replace(kept, step=samples.step * (found[0].rms <= samples.step))
     if kept.y is not samples.y or kept.step != samples.step:
         samples = kept
-        found = _with_general(samples, delays)
+        found = sorted(fitted(samples, one.structure, one.fit) for one in found)
     cut = samples.last - round(HELD_OUT * len(samples.fitted_y))
     structures = [
         Structure(order, delay, integrator) for integrator in options.integrators
         for delay in delays for order in options.orders if order >= integrator]
     progress('comparing orders and delays')
-    compared = _compare(samples, found[:2], structures, cut)
+    likely = [one for one in found[:2] if one.squares <= HOPELESS * found[0].squares]
+    compared = _compare(samples, likely, structures, cut)
     progress('refining')
     for _ in structures:
         chosen = selected(compared)
@@ -164,7 +167,8 @@ def _of_gaps(samples: Samples, like: Model) -> list[Model]:
     some = sorted(fitted(samples, structure, begin, steps=FIRST_STEPS) for begin in begins)
     models: list[Model] = []
     for one in some:
-        model = one if one.squares > 1.5 * some[0].squares else fitted(samples, structure, one.fit)
+        hopeless = one.squares > HOPELESS * some[0].squares
+        model = one if hopeless else fitted(samples, structure, one.fit)
         if all(abs(model.gap - other.gap) > apart * other.gap for other in models):
             models.append(model)
     return sorted(models)
@@ -196,12 +200,15 @@ def _compare(
         begin = min(first_model(train, structure, like.gap, like.fit.p0) for like in candidates)
         smaller = found.get(replace(structure, order=structure.order - 1))
         also = [smaller[0].begin_with_pole(0.6, structure)] if smaller else []
-        trained = fitted(train, structure, begin.fit, *also, steps=FIRST_STEPS)
-        found[structure] = trained, fitted(samples, structure, trained.fit)
+        trained = fitted(train, structure, begin.fit, *also, steps=FIRST_STEPS, least_gain=ALIKE)
+        found[structure] = trained, fitted(
+            samples, structure, trained.fit, steps=FIRST_STEPS, least_gain=ALIKE)
     best = min(whole for _, whole in found.values())
     count, rows = len(best.left), effective(best.left)
     compared = []
     for structure, (trained, whole) in found.items():
+        if whole.squares <= HOPELESS * best.squares:
+            whole = fitted(samples, structure, whole.fit, least_gain=ALIKE)
         error = later.fitted_y - _predicted(trained, later)
         error = error[np.isfinite(later.fitted_y)]
         rms = float(np.sqrt(np.mean(error**2)))
@@ -296,8 +303,9 @@ def later(early: StructureSearch, options: Options, progress: Progress) -> Struc
         if o.unexplained and best_other(o):
             break
         progress('searching later delays')
+        at = _likeliest_delay(samples, early.best, range(last, latest + 1))
         late = searched(samples.v, samples.y, samples.units, options,
-                        range(last, min(last + len(EARLY), latest) + 1), progress)
+                        range(max(at - 2, last), min(at + 2, latest) + 1), progress)
         rows, best = effective(late.best.left), early.best
         better = rows * log(max(best.rms, EXACT) / max(late.best.rms, EXACT)) + 0.5 * log(rows) * (
             best.structure.unknowns - late.best.structure.unknowns)
@@ -307,6 +315,16 @@ def later(early: StructureSearch, options: Options, progress: Progress) -> Struc
                 early.apart, by_model(best.gap, [(late.best.gap, -2.0 * better)])))
         early = late
     return early
+
+
+def _likeliest_delay(samples: Samples, like: Model, delays: range) -> int:
+    """That of these with which the same structure leaves least."""
+    samples, begin, squares = replace(samples, first=delays[-1] + 1), like.begin(), []
+    for delay in delays:
+        found = fitted(samples, replace(like.structure, delay=delay), begin, steps=FEW_STEPS)
+        begin = found.begin()
+        squares.append(found.squares)
+    return delays[int(np.argmin(squares))]
 
 
 def observed_of(samples: Samples, best: Model) -> Observed:

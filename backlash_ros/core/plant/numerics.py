@@ -41,7 +41,7 @@ def lfilter(
     from scipy.linalg import lapack  # where it is needed: 31 MB
 
     # The recursion is a triangular system: its lower band, a column per sample.
-    band = np.repeat(np.array(poles)[:, np.newaxis], count, axis=1)
+    band = np.repeat([poles], count, axis=0).T
     solved, _ = lapack.dtbtrs(band, y.reshape(-1, count).T, uplo='L', diag='U', overwrite_b=1)
     return np.ascontiguousarray(solved.T).reshape(y.shape)
 
