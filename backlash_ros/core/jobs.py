@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from importlib import import_module
+from io import BufferedRWPair
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Event, Thread
@@ -29,31 +30,6 @@ class Failure(NamedTuple):
     """What comes of a job without a result: the class of its exception, LOST of a dead worker."""
 
     kind: str
-
-
-class Link:
-    """Messages of bytes over a socket, each behind its length (multiprocessing takes 2 MB)."""
-
-    def __init__(self, end: socket.socket) -> None:
-        self._end, self._stream = end, end.makefile('rwb')
-
-    def send_bytes(self, body: bytes) -> None:
-        self._stream.write(len(body).to_bytes(8, 'little'))
-        self._stream.write(body)
-        self._stream.flush()
-
-    def recv_bytes(self) -> bytes:
-        """The next message; raises EOFError where the other end is gone."""
-        size = int.from_bytes(self._stream.read(8), 'little')
-        body = self._stream.read(size)
-        if not size or len(body) < size:
-            raise EOFError
-        return body
-
-    def close(self) -> None:
-        with suppress(OSError):  # of what could not be sent any more
-            self._stream.close()
-        self._end.close()
 
 
 class Channel:
@@ -154,12 +130,13 @@ class WorkerExecutor(Executor):
             while not (asked or channel.closed or self._closed.is_set()):
                 try:
                     self._worker = self._worker or _start(*self._arguments)
-                    self._worker.link.send_bytes(job)
+                    _send(self._worker.stream, job)
                     asked = True
-                    body = self._worker.link.recv_bytes()
+                    body = pickle.load(self._worker.stream)
                     # Not here, where it would keep the loop waiting.
                     channel.result, deaths = partial(pickle.loads, body), 0
-                except (OSError, EOFError):  # of a start: no memory, or no more processes
+                # Of a start: no memory, or no more processes.
+                except (OSError, EOFError, pickle.UnpicklingError):
                     self._end_worker()
                     self.restarts, deaths = self.restarts + 1, deaths + 1
                     if asked:
@@ -173,14 +150,15 @@ class WorkerExecutor(Executor):
         if worker is not None:
             worker.process.kill()
             worker.process.wait()
-            worker.link.close()
+            with suppress(OSError):  # of what could not be sent any more
+                worker.stream.close()
 
 
 class Worker(NamedTuple):
-    """A worker process, and where jobs go and results come from."""
+    """A worker process, and where pickled jobs go and pickled results come from."""
 
     process: subprocess.Popen[bytes]
-    link: Link
+    stream: BufferedRWPair
 
 
 def _start(preload: tuple[str, ...], loops: int) -> Worker:
@@ -188,7 +166,8 @@ def _start(preload: tuple[str, ...], loops: int) -> Worker:
     handle = other_end.fileno()
     code = f'import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve; ' \
         f'serve({handle}, {preload!r}, {loops})'
-    with other_end:
+    with own_end, other_end:
+        stream = own_end.makefile('rwb')
         process = subprocess.Popen(
             [sys.executable, '-c', code], pass_fds=[handle],
             # In a session of its own it gets no Ctrl-C, not even while it starts, and what it takes
@@ -203,7 +182,13 @@ def _start(preload: tuple[str, ...], loops: int) -> Worker:
     os.setpriority(os.PRIO_PROCESS, process.pid, niceness)
     with suppress(OSError):  # a kernel that does not share the processors between sessions
         Path(f'/proc/{process.pid}/autogroup').write_text(str(niceness))
-    return Worker(process, Link(own_end))
+    return Worker(process, stream)
+
+
+def _send(stream: BufferedRWPair, body: bytes) -> None:
+    """Send what was pickled, as one object to pickle: so it is read as a whole."""
+    pickle.dump(body, stream, -1)
+    stream.flush()
 
 
 # --- in the worker ------------------------------------------------------------------------------
@@ -213,8 +198,8 @@ def serve(handle: int, preload: Sequence[str], loops: int) -> None:
     """Compute jobs that come through an inherited connection, until it ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)
-    link, requests = Link(socket.socket(fileno=handle)), SimpleQueue[bytes]()
-    Thread(target=_receive, args=(link, requests), daemon=True).start()
+    stream, requests = socket.socket(fileno=handle).makefile('rwb'), SimpleQueue[bytes]()
+    Thread(target=_receive, args=(stream, requests), daemon=True).start()
     for name in preload:
         import_module(name)
     # Where nothing explains what a plant does, one search follows the other. On average they get
@@ -224,18 +209,18 @@ def serve(handle: int, preload: Sequence[str], loops: int) -> None:
     while True:
         job = requests.get()
         began = time.process_time()
-        link.send_bytes(_result_of(job))
+        _send(stream, _result_of(job))
         credit_s += share * (time.monotonic() - since)
         since = time.monotonic()
         credit_s = min(credit_s, burst_s) - (time.process_time() - began)
         time.sleep(max(-credit_s / share, 0.0))
 
 
-def _receive(link: Link, requests: SimpleQueue[bytes]) -> None:
+def _receive(stream: BufferedRWPair, requests: SimpleQueue[bytes]) -> None:
     """Read requests, also while a job is computed, and end the process with the connection."""
-    with suppress(EOFError, OSError):
+    with suppress(EOFError, OSError, pickle.UnpicklingError):
         while True:
-            requests.put(link.recv_bytes())
+            requests.put(pickle.load(stream))
     os._exit(0)
 
 
