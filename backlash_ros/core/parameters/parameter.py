@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache, partial
-from math import inf, isfinite, isinf, isnan
+from math import inf, isfinite, isinf, isnan, nan
 from typing import Any, get_args, get_type_hints
 
 Value = bool | int | float | str | tuple[float, ...] | tuple[str, ...]
@@ -25,10 +25,10 @@ class ParameterError(ValueError):
 class Parameter:
     """A parameter. elements: the types of those of a list, with ... for any number of them.
 
-    low, high: bounds, of each element; above: low itself is excluded. choices: allowed words, each
-    with what it stands for. used_by: executables that read it. change: 'live' in a running node, in
-    an 'unconfigured' controller, or 'never'. per_node: a controller with several joints has it
-    once.
+    low, high: bounds, of each element, which themselves are allowed; above: a bound that is not,
+    nan for none. choices: allowed words, each with what it stands for. used_by: executables that
+    read it. change: 'live' in a running node, in an 'unconfigured' controller, or 'never'.
+    per_node: a controller with several joints has it once.
     """
 
     name: str
@@ -38,7 +38,7 @@ class Parameter:
     unit: str = ''
     low: float = -inf
     high: float = inf
-    above: bool = False
+    above: float = nan
     choices: Mapping[str, str] = field(default_factory=dict)
     used_by: tuple[str, ...] = ('controller',)
     change: str = 'unconfigured'
@@ -62,7 +62,7 @@ class Parameter:
     @property
     def rules(self) -> str:
         """The bounds in words, empty without any."""
-        bounds = ('>' if self.above else '>=', self.low), ('<=', self.high)
+        bounds = ('>', self.above), ('>=', self.low), ('<=', self.high)
         return ' and '.join(f'{sign} {bound:g}' for sign, bound in bounds if isfinite(bound))
 
 
@@ -174,8 +174,7 @@ def _number(parameter: Parameter, value: Any) -> float:
         raise refused(number, 'must be finite')
     if isfinite(number) and abs(number) > 1e100:  # squares, and products of two, still are numbers
         raise refused(number, 'must be within ±1e+100', 'choose another unit')
-    excluded = parameter.above and number == parameter.low
-    if excluded or not parameter.low <= number <= parameter.high:
+    if number <= parameter.above or not parameter.low <= number <= parameter.high:
         unit = f' [{parameter.unit}]' if parameter.unit else ''
         raise refused(number, f'must be {parameter.rules}{unit}')
     return number

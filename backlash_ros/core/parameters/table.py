@@ -28,9 +28,8 @@ class PlantModel(NamedTuple):
         (1e-05, 4e-05, 1e-05), 'numerator of G(z), descending powers of z')
     denominator: tuple[float, ...] = of_both(
         (1.0, -2.88504, 2.77196, -0.88692), 'denominator of G(z), descending powers of z')
-    uncertainty: float = option(
-        0.2, 'relative spread of the time constants, damping and delay of G; 0: G is exact',
-        low=0.0, high=1.0)
+    uncertainty: float = option(0.2, 'relative spread of the time constants, damping and delay of '
+                                'G; 0: G is exact', low=0.0, high=1.0)
     adapt: bool = option(True, 'redesign gains and preview for the G that was learned')
 
 
@@ -45,14 +44,13 @@ class ActuatorModel(NamedTuple):
 
 
 class InitialEstimate(NamedTuple):
-    m: float = option(0.696, 'first estimate of the slope', 'u/v', low=0.0, above=True)
+    m: float = option(0.696, 'first estimate of the slope', 'u/v', above=0.0)
     c_r: float = option(0.5, 'first estimate of the right crossing', 'v')
     c_l: float = option(-0.5, 'first estimate of the left crossing', 'v')
 
 
 class EstimateBounds(NamedTuple):
-    m: tuple[float, float] = option(
-        (0.01, 100.0), 'interval of the slope', 'u/v', low=0.0, above=True)
+    m: tuple[float, float] = option((0.01, 100.0), 'interval of the slope', 'u/v', above=0.0)
     c_r: tuple[float, float] = option(
         (-100.0, 100.0), 'interval of the right crossing, which an offset of u moves too', 'v')
     c_l: tuple[float, float] = option(
@@ -78,21 +76,19 @@ class EstimatorOptions(NamedTuple):
         'auto', 'take v from applied_control instead of the own command; auto: as soon as the '
         'driver reports every sample, as long as it does, and where control.delay_samples is 0',
         choices=('auto', 'true', 'false'), change='never')
-    lag: int = option(
-        20, 'lms and printed: samples by which the reconstruction of u looks back', 'samples',
-        low=10, high=1000)
+    lag: int = option(20, 'lms and printed: samples by which the reconstruction of u looks back',
+                      'samples', low=10, high=1000)
 
 
 class LmsSteps(NamedTuple):
-    step: float = option(
-        1.0, 'step of the normalised LMS on (m, m c_r, m c_l)', low=0.0, high=2.0, above=True,
-        change='live')
+    step: float = option(1.0, 'step of the normalised LMS on (m, m c_r, m c_l)', above=0.0,
+                         high=2.0, change='live')
     step_f: float = option(
         0.0, 'step of the normalised LMS on f, 0 keeps f', low=0.0, high=2.0, change='live')
 
 
 class GradientStep(NamedTuple):
-    step: float = option(1.0, 'gradient: step on (m, m c_r, m c_l)', low=0.0, high=2.0, above=True)
+    step: float = option(1.0, 'gradient: step on (m, m c_r, m c_l)', above=0.0, high=2.0)
 
 
 class ProportionalGain(NamedTuple):
@@ -101,13 +97,11 @@ class ProportionalGain(NamedTuple):
 
 
 class TrackingWeights(NamedTuple):
-    preview: int = option(
-        60, 'tracking: samples of y_m looked at ahead; y follows y_m delayed by as many',
-        'samples', low=0, high=10000)
-    input_weight: float = option(
-        0.01, 'tracking, pole_placement: weight of the square of u less what holds y at the '
-        'reference, in units of |G|^2 at a twentieth of the sampling rate', low=0.0, above=True,
-        change='live')
+    preview: int = option(60, 'tracking: samples of y_m looked at ahead; y follows y_m delayed by '
+                          'as many', 'samples', low=0, high=10000)
+    input_weight: float = option(0.01, 'tracking, pole_placement: weight of the square of u less '
+                                 'what holds y at the reference, in units of |G|^2 at a twentieth '
+                                 'of the sampling rate', above=0.0, change='live')
     integral_weight: float = option(
         0.0, 'tracking: weight of the squared integral of y_m - y; 0, for none, suffices where the '
         'law learns, as effective crossings take up a constant disturbance', low=0.0, change='live')
@@ -119,14 +113,13 @@ class PolePlacementFilter(NamedTuple):
 
 
 class InverseOptions(NamedTuple):
-    caution: float = option(
-        1.0, 'tracking: standard deviations by which the crossings are shrunk', low=0.0,
-        high=100.0, change='live')
+    caution: float = option(1.0, 'tracking: standard deviations by which the crossings are shrunk',
+                            low=0.0, high=100.0, change='live')
     direction_band: float = option(
         0.0, 'u_d has turned only after coming back by more than this', 'u', low=0.0, change='live')
     take_up_rate: float = option(
         inf, 'largest speed of v while it crosses the gap; in proportional also while it goes '
-        'over to a line that new estimates have moved', 'v/s', low=0.0, above=True, change='live')
+        'over to a line that new estimates have moved', 'v/s', above=0.0, change='live')
 
 
 class FixedDoubt(NamedTuple):
@@ -139,13 +132,12 @@ class ControlLimits(NamedTuple):
         0, 'samples between control and its effect', 'samples', low=0, high=100)
     min: float = option(-inf, 'smallest v', 'v', change='live')
     max: float = option(inf, 'largest v', 'v', change='live')
-    rate_max: float = option(inf, 'largest speed of v', 'v/s', low=0.0, above=True, change='live')
+    rate_max: float = option(inf, 'largest speed of v', 'v/s', above=0.0, change='live')
     acceleration_max: float = option(
         inf, 'largest acceleration of v, so that a stepper loses no steps; v brakes in time for '
-        'its bounds and for where it is to go', 'v/s^2', low=0.0, above=True, change='live')
-    initial: float = option(
-        inf, 'v that acts when the controller starts, where no applied_control tells it; .inf: '
-        'not known', 'v')
+        'its bounds and for where it is to go', 'v/s^2', above=0.0, change='live')
+    initial: float = option(inf, 'v that acts when the controller starts, where no applied_control '
+                            'tells it; .inf: not known', 'v')
 
 
 class Timeouts(NamedTuple):
@@ -174,26 +166,22 @@ class DriverMessages(NamedTuple):
         'robot_joint_states, commands as io.command says',
         choices=('native', 'ros2_control', 'joint_state_topic'),
         used_by=(CONTROLLER, REFERENCE_NODE, RECORDER))
-    command: str = of_node(
-        'joint_state', 'joint_state_topic: JointState on joint_commands, or an array of all '
-        'joints on forward_command_controller/commands', choices=('joint_state', 'array'),
-        used_by=(CONTROLLER, RECORDER))
-    together: bool = of_node(
-        True, 'where one joint is silent for timeout.plant_output, all joints do on_timeout, '
-        'until it is back')
-    joint: str = of_node(
-        '', 'name of the joint in JointState, empty where there is just one',
-        used_by=(CONTROLLER, REFERENCE_NODE))
+    command: str = of_node('joint_state', 'joint_state_topic: JointState on joint_commands, or an '
+                           'array of all joints on forward_command_controller/commands',
+                           choices=('joint_state', 'array'), used_by=(CONTROLLER, RECORDER))
+    together: bool = of_node(True, 'where one joint is silent for timeout.plant_output, all joints '
+                             'do on_timeout, until it is back')
+    joint: str = of_node('', 'name of the joint in JointState, empty where there is just one',
+                         used_by=(CONTROLLER, REFERENCE_NODE))
     field: str = of_node(
         'position', 'what of the joint is y in JointState',
         choices=('position', 'velocity', 'effort'), used_by=(CONTROLLER, REFERENCE_NODE))
-    best_effort: bool = of_node(
-        False, 'listen to a driver that publishes best effort, which may lose messages',
-        used_by=(CONTROLLER, REFERENCE_NODE, RECORDER))
+    best_effort: bool = of_node(False, 'listen to a driver that publishes best effort, which may '
+                                'lose messages', used_by=(CONTROLLER, REFERENCE_NODE, RECORDER))
 
 
 class SimulatedBacklash(NamedTuple):
-    m: float = simulated(1.3, 'simulated slope', 'u/v', low=0.0, above=True, change='live')
+    m: float = simulated(1.3, 'simulated slope', 'u/v', above=0.0, change='live')
     c_r: float = simulated(3.0, 'simulated right crossing', 'v', change='live')
     c_l: float = simulated(-3.0, 'simulated left crossing', 'v', change='live')
     initial_u: float = simulated(0.0, 'simulated u held at the start', 'u')
@@ -210,14 +198,12 @@ class TruePlant(NamedTuple):
         (), 'numerator of the simulated G(z), empty: plant.numerator')
     denominator: tuple[float, ...] = simulated(
         (), 'denominator of the simulated G(z), empty: plant.denominator')
-    delay_samples: int = simulated(
-        -1, 'simulated samples between control and its effect, -1: control.delay_samples',
-        'samples', low=-1, high=100)
+    delay_samples: int = simulated(-1, 'simulated samples between control and its effect, -1: '
+                                   'control.delay_samples', 'samples', low=-1, high=100)
     scale_frequency: float = simulated(
-        1.0, 'simulated G(z): factor on the natural frequency of every pole', low=0.0, above=True)
-    scale_damping: float = simulated(
-        1.0, 'simulated G(z): factor on the damping ratio of every complex pair of poles',
-        low=0.0, above=True)
+        1.0, 'simulated G(z): factor on the natural frequency of every pole', above=0.0)
+    scale_damping: float = simulated(1.0, 'simulated G(z): factor on the damping ratio of every '
+                                     'complex pair of poles', above=0.0)
     extra_lag: float = simulated(
         0.0, 'simulated dead time of u, parts of a sample included', 's', low=0.0)
     walk_std: float = simulated(
@@ -228,24 +214,21 @@ class TruePlant(NamedTuple):
 class NodeParameters:
     """What nodes are given beside the numbers of control."""
 
-    sample_period: float = option(
-        0.01, 'sample period T of G(z)', 's', low=0.0, above=True,
-        used_by=(CONTROLLER, PLANT, REFERENCE_NODE), per_node=True)
+    sample_period: float = option(0.01, 'sample period T of G(z)', 's', above=0.0,
+                                  used_by=(CONTROLLER, PLANT, REFERENCE_NODE), per_node=True)
     actuator: ActuatorModel
     lockstep: bool = of_node(
         False, 'run as fast as the machine allows: each sample waits for reference and control',
         used_by=(CONTROLLER, PLANT, REFERENCE_NODE, RECORDER))
-    wait_for_subscribers: int = of_node(
-        0, 'start only when the main topic has this many listeners', low=0,
-        used_by=(CONTROLLER, PLANT, REFERENCE_NODE))
+    wait_for_subscribers: int = of_node(0, 'start only when the main topic has this many listeners',
+                                        low=0, used_by=(CONTROLLER, PLANT, REFERENCE_NODE))
     autostart: bool = of_node(True, 'configure and activate at the start, without being asked')
     on_stop: str = option(
         'hold', 'last command at deactivation and at the end: v is held, set to zero as fast as '
         'control.rate_max allows (none: at once), or ramped to zero at control.rate_max, which '
         'must be set then', choices=('hold', 'zero', 'ramp'), change='live', per_node=True)
-    on_timeout: str = option(
-        'hold', 'the same while plant_output is silent', choices=('hold', 'zero', 'ramp'),
-        change='live', per_node=True)
+    on_timeout: str = option('hold', 'the same while plant_output is silent',
+                             choices=('hold', 'zero', 'ramp'), change='live', per_node=True)
     on_rival: str = option(
         'stand_down', 'what to do where another node published control before this one was '
         'activated: publish nothing until it is gone, or go on and report it',
@@ -265,9 +248,8 @@ class ControllerParameters:
     estimates: SavedEstimates
     lms: LmsSteps
     gradient: GradientStep
-    structure: str = option(
-        'proportional', 'linear part that makes u_d',
-        choices=('proportional', 'tracking', 'pole_placement'))
+    structure: str = option('proportional', 'linear part that makes u_d',
+                            choices=('proportional', 'tracking', 'pole_placement'))
     proportional: ProportionalGain
     tracking: TrackingWeights
     pole_placement: PolePlacementFilter
@@ -299,11 +281,10 @@ class ReferenceParameters:
         choices=('sine', 'step', 'square', 'triangle', 'multisine', 'chirp', 'file'), change='live')
     amplitude: float = of_reference(10.0, 'amplitude of y_m', 'y_m', low=0.0, change='live')
     frequency: float = of_reference(
-        12.6, 'frequency of y_m (chirp: the last one)', 'rad/s', low=0.0, above=True, change='live')
+        12.6, 'frequency of y_m (chirp: the last one)', 'rad/s', above=0.0, change='live')
     frequency_start: float = of_reference(
-        0.63, 'first frequency of a chirp', 'rad/s', low=0.0, above=True, change='live')
-    sweep_time: float = of_reference(
-        10.0, 'duration of a chirp', 's', low=0.0, above=True, change='live')
+        0.63, 'first frequency of a chirp', 'rad/s', above=0.0, change='live')
+    sweep_time: float = of_reference(10.0, 'duration of a chirp', 's', above=0.0, change='live')
     bias: float = of_reference(0.0, 'constant added to y_m', 'y_m', change='live')
     file: str = of_reference('', 'CSV of rows t,y_m for waveform: file', change='live')
 
@@ -317,14 +298,12 @@ class RunParameters:
         '', 'folder of the bag, must not exist yet; empty for none', used_by=(RECORDER,))
     wait_for_publishers: bool = option(
         False, 'listen to plant_output only once all other nodes are heard', used_by=(RECORDER,))
-    axes: tuple[str, ...] = option(
-        (), 'names of the axes, each a namespace with nodes of its own, empty for one loop '
-        "without a namespace; 'y' and 'n' in quotes, as ROS 2 reads them as true and false",
-        used_by=(BRINGUP,))
-    driver: str = option(
-        '', 'command to start instead of plant, where {axis} stands for the name of the axis; '
-        'none waits for a driver that is started elsewhere, empty is the simulated plant',
-        used_by=(BRINGUP,))
+    axes: tuple[str, ...] = option((), 'names of the axes, each a namespace with nodes of its own, '
+                                   "empty for one loop without a namespace; 'y' and 'n' in quotes, "
+                                   'as ROS 2 reads them as true and false', used_by=(BRINGUP,))
+    driver: str = option('', 'command to start instead of plant, where {axis} stands for the name '
+                         'of the axis; none waits for a driver that is started elsewhere, empty is '
+                         'the simulated plant', used_by=(BRINGUP,))
 
 
 class ParameterTree(

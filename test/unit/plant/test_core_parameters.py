@@ -1,6 +1,6 @@
 """The parameter table and the check of values against it."""
 
-from math import inf, nan
+from math import inf, isnan, nan
 
 import pytest
 from hypothesis import given, settings
@@ -70,17 +70,18 @@ def test_any_unknown_name_is_refused_with_a_valid_one(name: str) -> None:
 def test_value_beyond_a_bound_is_refused_and_the_bound_itself_unless_excluded(parameter):
     count = len(parameter.default) if isinstance(parameter.default, tuple) else 0
     rules = []
-    if parameter.low > -inf:
-        rule = f'{">" if parameter.above else ">="} {parameter.low:g}'
-        rules = [(parameter.low - 1.0, rule), (parameter.low - 1e9, rule)]
+    low = parameter.low if isnan(parameter.above) else parameter.above
+    if low > -inf:
+        rule = f'{">=" if isnan(parameter.above) else ">"} {low:g}'
+        rules = [(low - 1.0, rule), (low - 1e9, rule)]
     if parameter.high < inf:
         rules.append((parameter.high + 1.0, f'<= {parameter.high:g}'))
     for value, rule in rules:
         assert rule in refusal_of(parameter.name, [value] * count if count else value)
-    if parameter in NUMBERS and parameter.above:
-        refusal_of(parameter.name, parameter.low)
-    elif parameter in NUMBERS and parameter.low > -inf:
-        assert Parameters({parameter.name: parameter.low})[parameter.name] == parameter.low
+    if parameter in NUMBERS and low > parameter.low:
+        refusal_of(parameter.name, low)
+    elif parameter in NUMBERS and low > -inf:
+        assert Parameters({parameter.name: low})[parameter.name] == low
 
 
 @named(NUMBERS)
@@ -102,7 +103,7 @@ def test_what_is_no_finite_number_is_refused_unless_infinity_means_no_limit(para
 
 @named(NUMBERS)
 def test_number_has_the_type_of_its_parameter(parameter: Parameter) -> None:
-    low = max(parameter.low + 0.5 * parameter.above, -1.0)
+    low = max(parameter.low, -1.0 if isnan(parameter.above) else parameter.above + 0.5)
     whole = next(i for i in (3, 1, -1, 0, 20) if low <= i <= parameter.high)
     is_real = isinstance(parameter.default, float)
     value = Parameters({parameter.name: whole if is_real else float(whole)})[parameter.name]
