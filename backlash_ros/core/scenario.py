@@ -4,6 +4,7 @@ Apart from assembly.py, so that the nodes for these start without loading what l
 """
 
 import csv
+from collections.abc import Callable, Mapping
 from math import asin, floor, isfinite, nan, pi, sin
 from pathlib import Path
 
@@ -13,7 +14,14 @@ from backlash_ros.core.plant.simulated_plant import SimulatedPlant, altered_plan
 from backlash_ros.core.plant.transfer_function import TransferFunction
 
 # Shapes of the phase alone, which go on where they are if the frequency changes.
-PERIODIC = ('sine', 'square', 'triangle', 'multisine')
+PERIODIC: Mapping[str, Callable[[float], float]] = {
+    'sine': sin,
+    'square': lambda phase: 1.0 if phase % (2.0 * pi) < pi else -1.0,
+    'triangle': lambda phase: 2.0 / pi * asin(max(-1.0, min(1.0, sin(phase)))),
+    # Schroeder's phases keep the crest low.
+    'multisine': lambda phase: sum(
+        sin(h * phase - pi * i * (i + 1) / 4) for i, h in enumerate((1, 2, 3, 5))) / 4,
+}
 
 
 def build_model(p: Parameters) -> TransferFunction:
@@ -55,9 +63,7 @@ class ReferenceSignal:
 
     def __init__(self, p: Parameters, samples: tuple[float, ...] = ()) -> None:
         self._p, self.waveform, self.frequency = p, p.waveform, p.frequency
-        self._samples = samples or read_reference_file(p)
-        if self.waveform == 'file' and not self._samples:
-            raise ParameterError('file', p.file, 'must hold at least one sample for waveform: file')
+        self._samples = samples or (_samples_of_file(p) if p.waveform == 'file' else ())
 
     def __call__(self, t: float) -> float:
         """y_m at time t >= 0 [s]."""
@@ -65,18 +71,10 @@ class ReferenceSignal:
 
     def _shape(self, t: float) -> float:
         phase = self.frequency * t
-        if self.waveform == 'sine':
-            return sin(phase)
+        if self.waveform in PERIODIC:
+            return PERIODIC[self.waveform](phase)
         if self.waveform == 'step':
             return 1.0 if phase >= pi else 0.0
-        if self.waveform == 'square':
-            return 1.0 if phase % (2.0 * pi) < pi else -1.0
-        if self.waveform == 'triangle':
-            return 2.0 / pi * asin(max(-1.0, min(1.0, sin(phase))))
-        if self.waveform == 'multisine':
-            # Schroeder's phases keep the crest low.
-            harmonics = enumerate((1, 2, 3, 5))
-            return sum(sin(h * self.frequency * t - pi * i * (i + 1) / 4) for i, h in harmonics) / 4
         if self.waveform == 'chirp':
             within, start = t % self._p.sweep_time, self._p.frequency_start
             slope = (self.frequency - start) / self._p.sweep_time
@@ -86,10 +84,11 @@ class ReferenceSignal:
         return self._samples[min(index, len(self._samples) - 1)]
 
 
-def read_reference_file(p: Parameters) -> tuple[float, ...]:
-    """Values of the CSV with header t,y_m and a row per sample period; () for other waveforms."""
-    if p.waveform != 'file':
-        return ()
+build_reference = ReferenceSignal
+
+
+def _samples_of_file(p: Parameters) -> tuple[float, ...]:
+    """Values of the CSV with header t,y_m and a row per sample period."""
     if not p.file:
         raise ParameterError('file', '', 'must name a CSV with rows t,y_m for waveform: file')
     try:
@@ -99,6 +98,8 @@ def read_reference_file(p: Parameters) -> tuple[float, ...]:
         raise ParameterError('file', p.file, f'cannot be read: {error}') from None
     if [cell.strip() for cell in header] != ['t', 'y_m']:
         raise ParameterError('file', p.file, 'must begin with the header t,y_m')
+    if not rows:
+        raise ParameterError('file', p.file, 'must hold at least one sample for waveform: file')
     samples: list[float] = []
     for line, row in enumerate(rows, start=2):
         due = len(samples) * p.sample_period
@@ -113,8 +114,3 @@ def read_reference_file(p: Parameters) -> tuple[float, ...]:
                 f'one row per sample_period={p.sample_period!r}')
         samples.append(y_m)
     return tuple(samples)
-
-
-def build_reference(p: Parameters) -> ReferenceSignal:
-    """y_m(t); reads the file for waveform: file."""
-    return ReferenceSignal(p)
