@@ -16,7 +16,7 @@ from backlash_ros.core.control.tracking.design import (
     preview_gains,
 )
 from backlash_ros.core.control.tracking.tracking import Tracking
-from backlash_ros.core.estimate import Bounds, Estimate, load_estimate
+from backlash_ros.core.estimate import Estimate, load_estimate
 from backlash_ros.core.estimation.estimator import MovingHorizon, fitted
 from backlash_ros.core.jobs import Executor
 from backlash_ros.core.law import Law
@@ -24,7 +24,7 @@ from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.laws.gradient import GradientEstimator
 from backlash_ros.core.laws.input_reconstruction import InputReconstruction
 from backlash_ros.core.laws.lms_and_printed import NormalisedLms, PrintedLaw
-from backlash_ros.core.parameters import BY_NAME, ParameterError, Parameters
+from backlash_ros.core.parameters import BY_NAME, Bounds, ParameterError, Parameters
 from backlash_ros.core.plant.numerics import FourBlocks, place_poles
 from backlash_ros.core.plant.transfer_function import (
     StateModel,
@@ -65,7 +65,7 @@ def build_controller(p: Parameters, estimate: Estimate | None = None,
     are made, None for here. Raises ParameterError for parameters that contradict each other.
     """
     check_model(build_model(p))
-    _check_first_guess(p)
+    _check_estimates(p)
     check_last_commands(p)
     inverse = BacklashInverse(p.inverse.direction_band, p.inverse.take_up_rate * p.sample_period)
     law = p.estimator.law
@@ -84,7 +84,7 @@ def build_controller(p: Parameters, estimate: Estimate | None = None,
 
 def _build_law(p: Parameters, initial: Estimate, executor: Executor) -> Law:
     options, model, noise_std = p.estimator, build_state_model(p), p.estimator.output_noise_std
-    bounds = Bounds(*options.bounds)
+    bounds = options.bounds
     if options.law == 'moving_horizon':
         given = initial if initial.learned else replace(initial, c_r=0.0, c_l=0.0)
         observer = None if p.structure == 'proportional' \
@@ -167,16 +167,20 @@ def warnings_of(p: Parameters, with_reference: bool = True) -> list[str]:
     return model_warnings(build_model(p), p.sample_period, p.frequency if with_reference else None)
 
 
-def _check_first_guess(p: Parameters) -> None:
-    initial, (low_f, high_f) = p.estimator.initial, p.proportional.bounds
-    for name in ('m', 'c_r', 'c_l'):
-        (low, high), value = getattr(p.estimator.bounds, name), getattr(initial, name)
-        if low < high and not low <= value <= high:
+def _check_estimates(p: Parameters) -> None:
+    """Raise ParameterError where first guesses and bounds contradict each other."""
+    initial, bounds = p.estimator.initial, p.estimator.bounds
+    for name, (low, high), value in zip(bounds._fields, bounds, initial, strict=True):
+        if low >= high:
+            raise ParameterError(f'estimator.bounds.{name}', [low, high],
+                                 'must be [low, high] with low < high')
+        if not low <= value <= high:
             raise ParameterError(f'estimator.initial.{name}', value, f'must lie within [{low:g}, '
                                  f'{high:g}]', f'change it or estimator.bounds.{name}')
     if initial.c_l > initial.c_r:
         raise ParameterError('estimator.initial.c_l', initial.c_l,
                              f'must be <= estimator.initial.c_r={initial.c_r!r}')
+    low_f, high_f = p.proportional.bounds
     if low_f >= high_f:
         raise ParameterError('proportional.bounds', [low_f, high_f],
                              'must be [low, high], low < high')

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.control.limits import plausible
-from backlash_ros.core.estimate import Bounds
 from backlash_ros.core.loop.command_history import REPORTED, report_use, v_of_intervals
 from backlash_ros.core.loop.diagnosis import SKEW, TROUBLE
 from backlash_ros.core.loop.sample_counter import UNNUMBERED, SampleCounter
@@ -269,11 +268,11 @@ def _of_motion(timing: Sampling, p: Parameters) -> Iterator[Row]:
     if timing.record is None:
         yield Row('backlash', True, 'v was not heard', past, MOTION)
         return
-    (v, y), expected, bounds = timing.record, p.control.delay_samples, p.estimator.bounds
+    (v, y), expected = timing.record, p.control.delay_samples
     noise_std = p.estimator.output_noise_std
     fit = fit_record(
         v, y, TransferFunction(p.plant.numerator, p.plant.denominator), p.plant.uncertainty,
-        noise_std, Bounds(bounds.m, bounds.c_r, bounds.c_l), range(expected + MORE_DELAY + 1))
+        noise_std, p.estimator.bounds, range(expected + MORE_DELAY + 1))
     best = fit.fit
     if best is None:
         yield Row('backlash', True, ''.join(fit.doubts[:1]), past, MOTION)

@@ -1,4 +1,4 @@
-"""Estimates of the backlash: their values, how far to trust them, their bounds, and their file.
+"""Estimates of the backlash: their values, how far to trust them, and their file.
 
 With the file a controller that is restarted need not learn from nothing.
 """
@@ -47,41 +47,6 @@ class Estimate:
     def learned(self) -> bool:
         """Whether it comes from data: a first guess has no deviations."""
         return not isnan(self.std_m)
-
-
-@dataclass(frozen=True)
-class Bounds:
-    """Projection intervals (low, high) of the estimates; 0 < m, c_l <= c_r."""
-
-    m: tuple[float, float] = (0.01, 100.0)
-    c_r: tuple[float, float] = (-100.0, 100.0)
-    c_l: tuple[float, float] = (-100.0, 100.0)
-
-    def __post_init__(self) -> None:
-        for name, (low, high) in vars(self).items():
-            if not low < high:
-                raise ParameterError(f'estimator.bounds.{name}', [low, high],
-                                     'must be [low, high] with low < high')
-        if not self.m[0] > 0.0:
-            raise ParameterError('estimator.bounds.m', list(self.m), 'must have low > 0')
-        if not self.c_l[0] < self.c_r[1]:
-            raise ParameterError('estimator.bounds.c_l', list(self.c_l),
-                                 f'must have low < {self.c_r[1]:g}, the largest c_r')
-
-    def project(self, m: float, c_r: float, c_l: float) -> tuple[float, float, float]:
-        """(m, c_r, c_l) inside the bounds, and c_l at c_r where it would lie to the right of it."""
-        m = min(max(m, self.m[0]), self.m[1])
-        c_r = min(max(c_r, self.c_r[0]), self.c_r[1])
-        c_l = min(max(c_l, self.c_l[0]), self.c_l[1])
-        if c_l > c_r:
-            c_r = min(max(0.5 * (c_l + c_r), self.c_r[0], self.c_l[0]), self.c_r[1])
-            c_l = min(c_r, self.c_l[1])
-        return m, c_r, c_l
-
-    def of_products(self, m: float, m_c_r: float, m_c_l: float) -> tuple[float, float, float]:
-        """(m, c_r, c_l) inside the bounds, from m, m c_r and m c_l."""
-        m = min(max(m, self.m[0]), self.m[1])
-        return self.project(m, m_c_r / m, m_c_l / m)
 
 
 def worth_saving(estimate: Estimate) -> bool:

@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from backlash_ros.core.estimate import Bounds
 from backlash_ros.core.estimation import explanations, settings
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.posterior import WindowFit
+from backlash_ros.core.parameters import Bounds, Parameters
 from backlash_ros.core.plant.transfer_function import Array, StateModel, TransferFunction
 from backlash_ros.core.records.readings import check_record, outliers
 from backlash_ros.core.simulation.run_record import turns
@@ -81,7 +81,8 @@ def fit_record(
         why = f'too few samples: {len(after)} after the longest delay' if few else 'v stood still'
         return RecordFit(nominal, nominal, (why,))
     setup = explanations.Setup(PlantFamily(nominal, uncertainty), max(noise_std, 1e-12),
-                               bounds or Bounds(), inf, float(np.ptp(v)), 0.0, np.zeros(3))
+                               bounds or Parameters().estimator.bounds, inf, float(np.ptp(v)), 0.0,
+                               np.zeros(3))
     fits = [_fitted(setup, v[longest - delay:len(v) - 1 - delay], after, bounds)._replace(
         delay=delay) for delay in delays]
     evidence = {each.delay: each.fit.evidence if each.fit else -inf for each in fits}

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimate import Bounds, Estimate, Status
+from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.estimation import settings
 from backlash_ros.core.estimation.belief import Belief, Kept, Known
 from backlash_ros.core.estimation.explanations import Setup
@@ -21,7 +21,7 @@ from backlash_ros.core.estimation.state_machine import learn
 from backlash_ros.core.jobs import Executor, Failure
 from backlash_ros.core.law import Interval, Law, LawReport
 from backlash_ros.core.laws.fixed import FixedBacklash
-from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.parameters import Bounds, Parameters
 from backlash_ros.core.plant.transfer_function import Array, StateModel, TransferFunction
 from backlash_ros.core.window import Recorder, Window
 

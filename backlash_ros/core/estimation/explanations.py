@@ -10,7 +10,6 @@ from math import inf, isnan, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimate import Bounds
 from backlash_ros.core.estimation import settings
 from backlash_ros.core.estimation.fit import FEW_STEPS, FIRST_STEPS, Problem
 from backlash_ros.core.estimation.plant_family import PlantFamily
@@ -18,6 +17,7 @@ from backlash_ros.core.estimation.posterior import Prior, WindowFit
 from backlash_ros.core.estimation.search import search
 from backlash_ros.core.estimation.unmodelled import with_walk
 from backlash_ros.core.law import OutOfBounds
+from backlash_ros.core.parameters import Bounds
 from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.window import Window
 

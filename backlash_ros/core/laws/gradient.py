@@ -22,9 +22,10 @@ from math import nan
 
 import numpy as np
 
-from backlash_ros.core.estimate import Bounds, Estimate, Status
+from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.law import Interval, Law
 from backlash_ros.core.laws.input_reconstruction import LEAST_SQUARE, MEMORY, Agreement
+from backlash_ros.core.parameters import Bounds
 from backlash_ros.core.plant.numerics import FourBlocks
 from backlash_ros.core.plant.transfer_function import Array
 

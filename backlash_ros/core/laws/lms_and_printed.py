@@ -21,14 +21,14 @@ Reference: S. Haykin, Adaptive Filter Theory, Prentice-Hall 1996, chapter 9 (the
 from collections import deque
 from math import isfinite, nan
 
-from backlash_ros.core.estimate import Bounds, Estimate, Status
+from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.law import Interval, Law
 from backlash_ros.core.laws.input_reconstruction import (
     LEAST_SQUARE,
     Agreement,
     InputReconstruction,
 )
-from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.parameters import Bounds, Parameters
 from backlash_ros.core.plant.transfer_function import Array
 
 STROKE = 8  # samples to either side over which u moves on in one direction

@@ -27,13 +27,14 @@ from backlash_ros.core.parameters.table import (
     PLANT,
     RECORDER,
     REFERENCE_NODE,
+    Bounds,
     ParameterTree,
 )
 
 __all__ = [
     'BRINGUP', 'BY_NAME', 'CONTROLLER', 'NODES', 'NOISE', 'PLANT', 'RECORDER', 'REFERENCE_NODE',
-    'UNTOLD', 'Parameter', 'ParameterError', 'Parameters', 'Value', 'as_yaml', 'check_names',
-    'check_value', 'entry_of',
+    'UNTOLD', 'Bounds', 'Parameter', 'ParameterError', 'Parameters', 'Value', 'as_yaml',
+    'check_names', 'check_value', 'entry_of',
 ]
 
 

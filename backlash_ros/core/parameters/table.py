@@ -49,12 +49,29 @@ class InitialEstimate(NamedTuple):
     c_l: float = option(-0.5, 'first estimate of the left crossing', 'v')
 
 
-class EstimateBounds(NamedTuple):
+class Bounds(NamedTuple):
+    """Intervals [low, high] into which estimates are projected."""
+
     m: tuple[float, float] = option((0.01, 100.0), 'interval of the slope', 'u/v', above=0.0)
     c_r: tuple[float, float] = option(
         (-100.0, 100.0), 'interval of the right crossing, which an offset of u moves too', 'v')
     c_l: tuple[float, float] = option(
         (-100.0, 100.0), 'interval of the left crossing, which an offset of u moves too', 'v')
+
+    def project(self, m: float, c_r: float, c_l: float) -> tuple[float, float, float]:
+        """(m, c_r, c_l) inside the bounds, and c_l at c_r where it would lie to the right of it."""
+        m = min(max(m, self.m[0]), self.m[1])
+        c_r = min(max(c_r, self.c_r[0]), self.c_r[1])
+        c_l = min(max(c_l, self.c_l[0]), self.c_l[1])
+        if c_l > c_r:
+            c_r = min(max(0.5 * (c_l + c_r), self.c_r[0], self.c_l[0]), self.c_r[1])
+            c_l = min(c_r, self.c_l[1])
+        return m, c_r, c_l
+
+    def of_products(self, m: float, m_c_r: float, m_c_l: float) -> tuple[float, float, float]:
+        """(m, c_r, c_l) inside the bounds, from m, m c_r and m c_l."""
+        m = min(max(m, self.m[0]), self.m[1])
+        return self.project(m, m_c_r / m, m_c_l / m)
 
 
 class EstimatorOptions(NamedTuple):
@@ -62,7 +79,7 @@ class EstimatorOptions(NamedTuple):
         'moving_horizon', 'law that learns m, c_r, c_l; kalman: a former name of moving_horizon',
         choices=('moving_horizon', 'kalman=moving_horizon', 'lms', 'printed', 'fixed', 'gradient'))
     initial: InitialEstimate = InitialEstimate()
-    bounds: EstimateBounds = EstimateBounds()
+    bounds: Bounds = Bounds()
     output_noise_std: float = option(
         1e-05, 'standard deviation of the noise on y; where it is not given, that of the simulated '
         'noise and quantum if there is any; not live for every law', 'y', low=0.0, change='live')

@@ -12,8 +12,9 @@ from backlash_ros.core.control.controller import AdaptiveController
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.limits import Limits
 from backlash_ros.core.control.structure import Proportional
-from backlash_ros.core.estimate import Bounds, Estimate
+from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.law import Interval, Law
+from backlash_ros.core.parameters import Bounds
 
 PAPER = Estimate(1.3, 3.0, -3.0, 0.22)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from records import PERIOD_S, Truth, output, resonance, swing
 
-from backlash_ros.core.estimate import Bounds
+from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.transfer_function import TransferFunction
 from backlash_ros.core.record_fit import RecordFit, fit_record
 from backlash_ros.core.records.readings import SEARCHED_AT_MOST
@@ -14,6 +14,7 @@ from backlash_ros.core.records.readings import SEARCHED_AT_MOST
 NOISE = 1e-3
 TRUTH = Truth()
 MODEL = resonance()
+BOUNDS = Parameters().estimator.bounds
 
 
 def record(
@@ -125,10 +126,10 @@ def test_why_there_is_no_fit_is_said(v: np.ndarray, reason: str) -> None:
 
 def test_bounds_limit_what_is_usable() -> None:
     v, y = record(500)
-    assert of(v, y, bounds=Bounds(m=(0.1, 2.0))).usable
-    fit = of(v, y, bounds=Bounds(m=(0.1, 1.0)))
+    assert of(v, y, bounds=BOUNDS._replace(m=(0.1, 2.0))).usable
+    fit = of(v, y, bounds=BOUNDS._replace(m=(0.1, 1.0)))
     assert any('m would be 1.3, outside' in reason for reason in fit.reasons)
-    narrow = of(v, y, bounds=Bounds(c_r=(0.0, 0.3), c_l=(-0.3, 0.0)))
+    narrow = of(v, y, bounds=BOUNDS._replace(c_r=(0.0, 0.3), c_l=(-0.3, 0.0)))
     assert not narrow.usable
 
 

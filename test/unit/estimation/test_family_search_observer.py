@@ -7,13 +7,13 @@ from scipy.optimize import least_squares
 from scipy.signal import cont2discrete
 from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR
 
-from backlash_ros.core.estimate import Bounds
 from backlash_ros.core.estimation.explanations import Setup, afresh
 from backlash_ros.core.estimation.late_commands import weighed
 from backlash_ros.core.estimation.observer import RATIOS, gain_of
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.posterior import independence, likelihood
 from backlash_ros.core.estimation.search import search
+from backlash_ros.core.parameters import Bounds, Parameters
 from backlash_ros.core.plant.backlash import play
 from backlash_ros.core.plant.numerics import lfilter
 from backlash_ros.core.plant.simulated_plant import altered_plant
@@ -144,7 +144,7 @@ def test_deviations_reach_as_far_along_the_gap_as_readings_leave_it_open(seed: i
     m, c_r, c_l = 0.92, 0.25, -1.2
     noise = 0.06 * np.random.default_rng(seed).standard_normal(len(v))
     y = lfilter(*family.at([0.0] * family.count), m * (play(v, c_r - c_l, -5.0 + c_r - c_l) - c_r))
-    setup = Setup(family, 0.06, Bounds(), 20.0, 5.4, 0.0, np.zeros(3))
+    setup = Setup(family, 0.06, Parameters().estimator.bounds, 20.0, 5.4, 0.0, np.zeros(3))
     found = afresh(setup, Window(0, v, y + noise, np.full(len(v), np.nan)))
     assert found is not None
     assert abs(found.gap - (c_r - c_l)) < 4.0 * found.gap_std

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR, KnownInput, eighths, output_of, plants
 
 from backlash_ros.core.assembly import build_controller, build_plant, build_reference
-from backlash_ros.core.estimate import Bounds, Estimate, Status
+from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.law import Interval
 from backlash_ros.core.laws.input_reconstruction import InputReconstruction
 from backlash_ros.core.laws.lms_and_printed import PrintedLaw, printed_c, printed_f, printed_m
@@ -42,7 +42,7 @@ def test_printed_c_reduces_to_the_solution_of_e_equal_0(u, y_m, f, m):
 
 @given(data=st.lists(st.tuples(st.floats(-20.0, 20.0), st.floats(-20.0, 20.0)), max_size=40))
 def test_guarded_law_stays_finite_and_within_its_bounds(data: list[tuple[float, float]]) -> None:
-    bounds = Bounds()
+    bounds = Parameters().estimator.bounds
     estimator = PrintedLaw(Estimate(0.696, 0.5, -0.5, 0.22), bounds, (-0.5, 0.5), KnownInput())
     # The paper's first sample, u = y_m = 0, leads to 0/0 in m and c.
     for u, y_m in [(0.0, 0.0), *data]:
