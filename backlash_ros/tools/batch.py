@@ -10,7 +10,6 @@ from concurrent.futures import CancelledError, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from itertools import product
 from math import inf
-from typing import NamedTuple
 
 import numpy as np
 import yaml
@@ -35,19 +34,10 @@ OUTCOME_COLUMNS = (
     *(f'{prefix}{name}' for prefix in OUTCOME_GROUPS for name in BACKLASH),
     'control_error_rms', 'tracking_error_rms', 'lost_samples', 'problem',
 )
+STATISTICS = 'bias', 'RMSE', 'settled, median', 'settled, last', 'within 1 %'
 Job = tuple[Parameters, int]  # one run: its parameters and its length in samples
 # What a run came to, under OUTCOME_COLUMNS; problem: why it broke off, '' where it did not.
 Outcome = Mapping[str, float | str | None]
-
-
-class ParameterStatistics(NamedTuple):
-    """Of one estimate over runs: settling times [s], inf for never; share of runs within 1 %."""
-
-    bias: float
-    rmse: float
-    settling_median: float
-    settling_max: float
-    within: float
 
 
 def combinations(texts: Sequence[str]) -> list[dict[str, Value]]:
@@ -161,8 +151,11 @@ def _on_cluster(jobs: Sequence[Job], address: str) -> Iterator[Outcome]:
         ) from None
 
 
-def statistics(outcomes: Sequence[Outcome]) -> dict[str, ParameterStatistics]:
-    """Of each estimate over the runs that did not break off; raises InputError where all did."""
+def statistics(outcomes: Sequence[Outcome]) -> dict[str, tuple[float, ...]]:
+    """STATISTICS of each estimate over the runs that did not break off.
+
+    Settling times in s, inf for never. Raises InputError where all broke off.
+    """
     whole = [outcome for outcome in outcomes if not outcome['problem']]
     if not whole:
         raise InputError(f'every run broke off, the first one with: {outcomes[0]["problem"]}')
@@ -171,10 +164,9 @@ def statistics(outcomes: Sequence[Outcome]) -> dict[str, ParameterStatistics]:
         final, truth, settling = (np.array([one[f'{prefix}{name}'] for one in whole], dtype=float)
                                   for prefix in ('', 'true_', 'settling_'))
         error, settling = final - truth, np.sort(np.where(np.isnan(settling), inf, settling))
-        found[name] = ParameterStatistics(
-            float(error.mean()), float(np.sqrt(np.mean(error**2))),
+        found[name] = tuple(map(float, (
+            error.mean(), np.sqrt(np.mean(error**2)),
             # The median of a number and "never" is never, not the nan of inf - inf.
-            float(settling[len(whole) // 2]), float(settling[-1]),
-            float(np.mean(np.abs(error) <= SETTLING_TOLERANCE * np.abs(truth))),
-        )
+            settling[len(whole) // 2], settling[-1],
+            np.mean(np.abs(error) <= SETTLING_TOLERANCE * np.abs(truth)))))
     return found

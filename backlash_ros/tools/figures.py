@@ -20,7 +20,7 @@ from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.simulation import run_record
 from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.tools.cli import number
-from backlash_ros.tools.runs.summary import ERROR_WINDOW_S, Part, moving_rms
+from backlash_ros.tools.runs.summary import ERROR_WINDOW_S, moving_rms
 from backlash_ros.topics import BACKLASH
 
 Line = tuple[Any, ...]  # what `curve` takes behind the axes: t, values, colour and further ones
@@ -34,7 +34,7 @@ HUES = {
 HATS = {'m': r'\hat{m}', 'c_r': r'\hat{c}_r', 'c_l': r'\hat{c}_l'}
 LINE_STYLES = {'m': '-', 'c_r': '--', 'c_l': '-.'}
 BACKLASH_UNITS = {'m': 'unit of u/v', 'c_r': 'unit of v', 'c_l': 'unit of v'}
-WHOLE_RUN = Part('Whole run', slice(None))
+WHOLE_RUN = {'Whole run': slice(None)}
 
 matplotlib.style.use(Path(__file__).with_suffix('.mplstyle'))
 
@@ -103,31 +103,33 @@ def limits(values: Sequence[Array], margin: float) -> tuple[float, float]:
 
 
 def draw_panels(
-    height: float, rows: Mapping[str, Sequence[Line]], parts: Sequence[Part] = (WHOLE_RUN,),
+    height: float, rows: Mapping[str, Sequence[Line]], parts: Mapping[str, slice] = WHOLE_RUN,
     frozen_in: RunRecord | None = None, laid_out: bool = True, **others: Any,
 ) -> tuple[Figure, NDArray[Any]]:
     """A figure whose columns show parts of a run, and its axes, shape (rows, parts).
 
-    rows: lines by what stands at the vertical axis. frozen_in: shades its times without learning.
+    rows: lines by what stands at the vertical axis. parts: rows of the run by name. frozen_in:
+    shades its times without learning.
     """
     figure = new_figure(height, laid_out)
     grid = np.asarray(figure.subplots(len(rows), len(parts), sharex='col', squeeze=False, **others))
-    for column, part in zip(grid.T, parts, strict=True):
-        label(column[0], part.name)
+    for axes, name in zip(grid[:, 0], rows, strict=True):
+        label(axes, y=name)
+    for column, (title, part) in zip(grid.T, parts.items(), strict=True):
+        label(column[0], title)
         label(column[-1], x=TIME_LABEL)
-        for axes, (name, lines) in zip(column, rows.items(), strict=True):
-            label(axes, y=name if part is parts[0] else '')
+        for axes, lines in zip(column, rows.values(), strict=True):
             for t, values, *look in lines:
                 if np.isfinite(values).any():
-                    curve(axes, t[part.rows], values[part.rows], *look)
+                    curve(axes, t[part], values[part], *look)
             if frozen_in is not None:
-                frozen = frozen_in.column('status')[part.rows] >= float(Status.NOT_EXCITED)
-                shade(axes, frozen_in.column('t')[part.rows], frozen, 'frozen')
+                frozen = frozen_in.column('status')[part] >= float(Status.NOT_EXCITED)
+                shade(axes, frozen_in.column('t')[part], frozen, 'frozen')
     return figure, grid
 
 
 def draw_parameter_errors(
-    run: RunRecord, start: Part, settling: Mapping[str, float | None],
+    run: RunRecord, start: slice, settling: Mapping[str, float | None],
 ) -> Figure:
     """Errors of the estimates over time, as Figure 4 of the paper, and their relative size."""
     t, tolerance = run.column('t'), 100.0 * run_record.SETTLING_TOLERANCE
@@ -142,7 +144,7 @@ def draw_parameter_errors(
         percents.append((t, size, hue, '', style, 1.5))
     figure, grid = draw_panels(7.4, {
         'true minus estimated': errors, 'size of the error [% of the true value]': percents,
-    }, (start, WHOLE_RUN), run, sharey='row')
+    }, {'Start': start, **WHOLE_RUN}, run, sharey='row')
     for absolute, relative in grid.T:
         for name in BACKLASH:
             if settling[name] is not None:
@@ -151,7 +153,7 @@ def draw_parameter_errors(
         absolute.set_ylim(*limits([error for _, error, *_ in errors], margin=0.08))
         relative.axhline(tolerance, color='#444444', linewidth=0.9, linestyle=':')
         relative.set_yscale('log')
-    grid[0, 0].set_xlim(*limits([t[start.rows]], margin=0.05))
+    grid[0, 0].set_xlim(*limits([t[start]], margin=0.05))
     legend_below(figure, grid[0, 1])
     return figure
 
@@ -183,20 +185,20 @@ def draw_estimates(run: RunRecord, recorded: RunRecord | None = None) -> Figure:
     return figure
 
 
-def draw_closer(run: RunRecord, values: Array, name: str, parts: Sequence[Part]) -> Figure:
+def draw_closer(run: RunRecord, values: Array, name: str, parts: Mapping[str, slice]) -> Figure:
     """A signal over the whole run, and beside it closer over each part."""
     lines = [(run.column('t'), values, HUES['e'])]
-    return draw_panels(3.6, {name: lines}, (WHOLE_RUN, *parts), run)[0]
+    return draw_panels(3.6, {name: lines}, {**WHOLE_RUN, **parts}, run)[0]
 
 
-def draw_hysteresis(run: RunRecord, end: Part) -> Figure:
+def draw_hysteresis(run: RunRecord, end: slice) -> Figure:
     """v-u loop at the end of the run with the true and the estimated lines."""
     figure = new_figure(6.0)
     axes = figure.subplots()
     v, truth = run.column('v'), run.has_truth
     m, c_r, c_l = (float(run.column(name)[-1]) for name in BACKLASH)
     u = run.column('u') if truth else m * (play(v, max(c_r - c_l, 0.0), c_r) - c_r)
-    span = np.array(limits([v[end.rows]], margin=0.15))
+    span = np.array(limits([v[end]], margin=0.15))
     for name, side, c in (('c_r', 'right', c_r), ('c_l', 'left', c_l)):
         if truth:
             true_m, true_c = run.column('true_m')[-1], run.column(f'true_{name}')[-1]
@@ -205,15 +207,15 @@ def draw_hysteresis(run: RunRecord, end: Part) -> Figure:
         curve(axes, span, m * (span - c), HUES[name],
               f'estimated {side} line\n${HATS["m"]}(v - {HATS[name]})$', '--', 1.6)
     curve(axes, v, u, '#999999', 'earlier', width=0.8)
-    curve(axes, v[end.rows], u[end.rows], HUES['u'], 'at the end')
-    axes.set(xlim=span, ylim=limits([u[end.rows]], margin=0.25))
+    curve(axes, v[end], u[end], HUES['u'], 'at the end')
+    axes.set(xlim=span, ylim=limits([u[end]], margin=0.25))
     label(axes, 'u = B[v]' if truth else 'u = B[v] as the last estimates see it',
           'u [unit of u]', 'control v [unit of v]')
     axes.legend(loc='upper left', bbox_to_anchor=(1.01, 1.0))
     return figure
 
 
-def draw_output(run: RunRecord, end: Part, delay: int, followed: bool) -> Figure:
+def draw_output(run: RunRecord, end: slice, delay: int, followed: bool) -> Figure:
     """Reference, `delay` samples late, and output: on one scale where y follows, else on two."""
     t, y, y_m = run.column('t'), run.column('y'), run_record.delayed_reference(run, delay)
     late = f', {delay * run.sample_period:.4g} s late' if delay else ''
@@ -223,13 +225,13 @@ def draw_output(run: RunRecord, end: Part, delay: int, followed: bool) -> Figure
         'y minus reference [unit of y]': [(t, y - y_m, HUES['y'])],
     } if followed else {
         f'reference $y_m$ [unit of $y_m$]{late}': [reference], 'output y [unit of y]': [output],
-    }, (WHOLE_RUN, end))
+    }, {**WHOLE_RUN, 'End': end})
     if followed:
         legend_above(grid[0, 1])
     return figure
 
 
-def draw_input(run: RunRecord, parts: Sequence[Part]) -> Figure:
+def draw_input(run: RunRecord, parts: Mapping[str, slice]) -> Figure:
     t = run.column('t')
     figure, grid = draw_panels(5.6, {
         'input of G [unit of u]': [(t, run.column('u'), HUES['u'], 'u', '-', 1.6),

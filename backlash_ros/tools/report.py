@@ -57,7 +57,8 @@ def _figures(
         yield Picture('log.png', 'v and y', 'What the log holds. With play, y over v is a loop '
                       'with level stretches where v turns.', png(figures.draw_log(run)))
         return
-    start, end = parts = told.interesting_parts(run)
+    start, end = told.interesting_parts(run)
+    parts = {'Start': start, 'End': end}
     truth, error, innovation = run.has_truth, control_error(run), run.column('innovation')
     laws, notes = told.compare_laws(run, parameters) if truth and parameters else ({}, [])
     known = np.isfinite(error).any()

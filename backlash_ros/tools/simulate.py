@@ -13,7 +13,6 @@ from backlash_ros.core.parameters import Parameters, as_yaml
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.options import OptionParser
 from backlash_ros.tools import batch, cli
-from backlash_ros.tools.cli import NOTHING, InputError
 from backlash_ros.tools.config import effective_parameters, write_config
 from backlash_ros.tools.runs.files import CONFIG_FILE, Run, result_directory, write_table
 from backlash_ros.tools.runs.read_run import run_loop
@@ -37,7 +36,7 @@ def _simulate(args: Sequence[str] | None) -> None:
     options = make_parser().parse_args(args)
     parameters = effective_parameters(options.config, options.settings, options.seed, options.axis)
     if options.seeds is not None and options.seeds < 1:
-        raise InputError(f'--seeds={options.seeds} must be >= 1')
+        raise cli.InputError(f'--seeds={options.seeds} must be >= 1')
     many = options.seeds is not None or options.sweep or options.cluster is not None
     (_many if many else _once)(parameters, options)
 
@@ -66,7 +65,7 @@ def _many(parameters: Parameters, options: argparse.Namespace) -> None:
     changes = batch.combinations(options.sweep)
     swept = list(changes[0])
     if 'seed' in swept and options.seeds is not None:
-        raise InputError('--seeds and --sweep seed=... exclude each other')
+        raise cli.InputError('--seeds and --sweep seed=... exclude each other')
     seeds = range(parameters.seed, parameters.seed + (options.seeds or 1))
     jobs = batch.make_jobs(parameters, changes, seeds, options.duration)
     if options.out is not None:
@@ -83,15 +82,14 @@ def _many(parameters: Parameters, options: argparse.Namespace) -> None:
     for i, change in enumerate(changes):
         group, values = outcomes[i * size:][:size], list(map(as_yaml, change.values()))
         if len(changes) > 1 and all(outcome['problem'] for outcome in group):
-            rows.append([*values, 'broke off', *[NOTHING] * 5])
+            rows.append([*values, 'broke off', *[cli.NOTHING] * len(batch.STATISTICS)])
             continue
         rows += [[
-            *values, name, f'{s.bias:+.3g}', f'{s.rmse:.3g}',
-            *('never' if time == inf else f'{time:.4g} s'
-              for time in (s.settling_median, s.settling_max)), f'{100.0 * s.within:.4g} %',
-        ] for name, s in batch.statistics(group).items()]
-    print(cli.format_table([*swept, '', 'bias', 'RMSE', 'settled, median', 'settled, last',
-                            'within 1 %'], rows))
+            *values, name, f'{bias:+.3g}', f'{rmse:.3g}',
+            *('never' if time == inf else f'{time:.4g} s' for time in settled),
+            f'{100.0 * within:.4g} %',
+        ] for name, (bias, rmse, *settled, within) in batch.statistics(group).items()]
+    print(cli.format_table([*swept, '', *batch.STATISTICS], rows))
     named: dict[str, list[int]] = {}
     for (run, _), outcome in zip(jobs, outcomes, strict=True):
         if outcome['problem']:

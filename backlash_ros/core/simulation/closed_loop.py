@@ -102,12 +102,11 @@ def replay(
 
 
 class Parting(NamedTuple):
-    """Row and time [s] where a replay parts from the run, and the estimate by name and values.
+    """Time [s] where a replay parts from the run, and the estimate by name and values.
 
     largest: difference over all rows, in standard deviations where they are known, else relative.
     """
 
-    sample: int
     t: float
     name: str
     recorded: float
@@ -126,6 +125,6 @@ def parting(recorded: RunRecord, replayed: RunRecord) -> Parting | None:
     std = recorded.rows[:, COLUMNS.index('std_m'):][:, :3]
     scale = np.where(np.isfinite(std) & (std > 0.0), std, np.maximum(np.abs(own), 1e-300))
     return Parting(
-        k, float(recorded.column('t')[k]), COLUMNS[first + i], float(own[k, i]),
+        float(recorded.column('t')[k]), COLUMNS[first + i], float(own[k, i]),
         float(again[k, i]), float(np.nanmax(np.where(differs, np.abs(own - again) / scale, 0.0))),
     )

@@ -236,14 +236,9 @@ def living(groups: Sequence[int]) -> set[int]:
     return found.intersection(groups)
 
 
-def guard() -> None:
-    """Stop what the last line of stdin names, once the supervisor has gone."""
+if __name__ == '__main__':  # the guardian
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
-    lines = sys.stdin.read().splitlines()
-    if lines:
-        stop_stages(*json.loads(lines[-1]))
-
-
-if __name__ == '__main__':
-    guard()
+    # What is to be stopped stands in the last line, which is complete once the supervisor has gone.
+    if told := sys.stdin.read().splitlines():
+        stop_stages(*json.loads(told[-1]))

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from math import isfinite
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -20,13 +20,6 @@ from backlash_ros.topics import BACKLASH
 
 ERROR_WINDOW_S = 0.5  # over which the error of a curve is averaged
 ESTIMATE_HEADER = ('estimate', 'std', 'truth', 'error', 'within 1 % from')
-
-
-class Part(NamedTuple):
-    """A stretch of a run with a name for it."""
-
-    name: str
-    rows: slice
 
 
 def summarise(
@@ -96,10 +89,10 @@ def estimate_table(summary: Mapping[str, Any], title: str = '') -> str:
                         [(name, *estimate_cells(summary, name)) for name in BACKLASH])
 
 
-def interesting_parts(run: RunRecord) -> tuple[Part, Part]:
-    """Start and end of a run, a tenth of it each, but 2 s at least."""
+def interesting_parts(run: RunRecord) -> tuple[slice, slice]:
+    """Rows of start and end of a run, a tenth of it each, but 2 s at least."""
     samples = min(max(run.samples // 10, round(2.0 / run.sample_period), 2), run.samples)
-    return Part('Start', slice(0, samples)), Part('End', slice(run.samples - samples, None))
+    return slice(0, samples), slice(run.samples - samples, None)
 
 
 def moving_rms(values: Array, sample_period: float) -> Array:
