@@ -30,7 +30,7 @@ HTML_SYMBOLS = {'m': 'm', 'c_r': 'c<sub>r</sub>', 'c_l': 'c<sub>l</sub>'}
 
 def write_report(run: files.Run, out: Path) -> dict[str, Any]:
     """Write report, figures, samples.csv and summary.json of a run to out; return the summary."""
-    summary = told.summarise(run.record, run.parameters, run.latency_s)
+    summary = told.summarise(run.record, run.parameters)
     lost, total = summary['lost_samples'], summary['lost_samples'] + summary['samples']
     if lost > 0.01 * total and not (run.parameters and run.parameters.output_loss):
         run = run._replace(notes=(*run.notes, (

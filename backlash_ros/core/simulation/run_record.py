@@ -15,7 +15,7 @@ from backlash_ros.core.scenario import build_model
 
 COLUMNS = (
     't', 'y_m', 'y', 'u_d', 'v', 'u', 'm', 'c_r', 'c_l', 'f', 'std_m', 'std_c_r', 'std_c_l',
-    'u_hat', 'innovation', 'status', 'true_m', 'true_c_r', 'true_c_l',
+    'u_hat', 'innovation', 'status', 'latency_s', 'true_m', 'true_c_r', 'true_c_l',
 )
 SETTLING_TOLERANCE = 0.01  # of the true value
 # At which the response of G is judged, as shares of the sampling rate: from slow motion to where
@@ -46,7 +46,7 @@ def row_of(
     e = step.estimate
     return (
         t, step.y_m, y, step.u_d, v, u, e.m, e.c_r, e.c_l, e.f, *stated_deviations(e), law.u_hat,
-        law.innovation, e.status, *truth,
+        law.innovation, e.status, nan, *truth,
     )
 
 
@@ -74,7 +74,9 @@ class RunRecord:
     """rows: shape (N, len(COLUMNS)), one per sample that reached the controller.
 
     t [s] counts sample periods from the first one. u and true_* are nan without a simulation.
-    Estimates stand as they were when v was computed. lost_samples: outputs that never arrived.
+    Estimates stand as they were when v was computed. latency_s: from the departure of y(k) at the
+    driver to that of v(k) at the controller, nan in a simulation. lost_samples: outputs that never
+    arrived.
     learned: what the controller believed of G at the end, None where it is not known.
     """
 

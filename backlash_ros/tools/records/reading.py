@@ -103,7 +103,7 @@ def read_run_or_log(
                     'y': record.y[known], 'v': record.v[known]})
     run_record = RunRecord(
         rows, record.sample_period, int(known[-1] - known[0] + 1 - len(known)))
-    return Run(run_record, parameters, None, (record.timing, *record.notes), applied)
+    return Run(run_record, parameters, (record.timing, *record.notes), applied)
 
 
 def _is_samples(path: Path) -> bool:

@@ -29,14 +29,12 @@ SAMPLE_COLUMNS = (*COLUMNS[:COLUMNS.index('u_hat')], 'status')
 class Run(NamedTuple):
     """A run that was simulated or recorded; parameters are None where they are unknown.
 
-    latency_s: from the departure of y(k) at the driver to that of v(k) at the controller, shape
-    (N,); None for a simulation. notes: on the source, a sentence each. applied: the v that acted
-    since the row before, for each row, as far as the driver or a log tells it; empty for nothing.
+    notes: on the source, a sentence each. applied: the v that acted since the row before, for each
+    row, as far as the driver or a log tells it; empty for nothing.
     """
 
     record: RunRecord
     parameters: Parameters | None
-    latency_s: Array | None = None
     notes: tuple[str, ...] = ()
     applied: Sequence[Sequence[float]] = ()
 

@@ -176,8 +176,7 @@ def read_bag(
         label: table[label] for table in (signals, estimates) for label in table.dtype.names or ()}}
     record = RunRecord(files.rows_of(columns), sample_period,
                        int(heard[-1] - heard[0]) + 1 - len(heard), learned)
-    return Run(record, None, columns['latency_s'],
-               tuple(filter(None, [damage, *notes, restarted])),
+    return Run(record, None, tuple(filter(None, [damage, *notes, restarted])),
                _reports(recorded, columns['y'], axis))
 
 

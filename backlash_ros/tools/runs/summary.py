@@ -22,16 +22,13 @@ ERROR_WINDOW_S = 0.5  # over which the error of a curve is averaged
 ESTIMATE_HEADER = ('estimate', 'std', 'truth', 'error', 'within 1 % from')
 
 
-def summarise(
-    run: RunRecord, parameters: Parameters | None, latency_s: Array | None = None,
-) -> dict[str, Any]:
+def summarise(run: RunRecord, parameters: Parameters | None) -> dict[str, Any]:
     """Figures of merit of a run, the content of summary.json; raises InputError without samples."""
     if run.samples == 0:
         raise InputError('the run holds no sample that reached the controller')
-    t, status = run.column('t'), run.column('status')
-    status = status[np.isfinite(status)]
+    t, status, latency = (run.column(name) for name in ('t', 'status', 'latency_s'))
+    status, latency = status[np.isfinite(status)], latency[np.isfinite(latency)]
     words = {float(state): state.word for state in Status}
-    latency = np.empty(0) if latency_s is None else latency_s[np.isfinite(latency_s)]
     first, newest = (dict(zip(COLUMNS, row, strict=True)) for row in run.rows[[0, -1]].tolist())
     learned, source = run.learned, None
     if parameters is not None:

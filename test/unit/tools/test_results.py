@@ -88,10 +88,11 @@ def test_summary_and_record_tell_the_model_that_was_believed_at_the_end(run, tmp
 
 
 def test_latency_is_given_in_milliseconds_without_the_unknown(run: run_record.RunRecord) -> None:
-    latency = np.array([0.001, nan, 0.002, 0.003])
-    summary = summarise(run, None, latency)
+    assert summarise(run, None)['loop_latency_ms'] is None
+    rows = run.rows[:4].copy()
+    rows[:, run_record.COLUMNS.index('latency_s')] = 0.001, nan, 0.002, 0.003
+    summary = summarise(replace(run, rows=rows), None)
     assert summary['loop_latency_ms'] == pytest.approx({'p50': 2.0, 'p99': 2.98})
-    assert summarise(run, None, np.full(3, nan))['loop_latency_ms'] is None
 
 
 def test_latest_points_at_the_newest_folder(tmp_path, monkeypatch):
