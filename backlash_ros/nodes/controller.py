@@ -70,7 +70,8 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
             # The first command begins with what the driver reports, even if it is not learned from.
             self._io.listen_to(self._io.topics.applied, self._on_report, KEPT_COMMANDS)
         # Lockstep: ticks of /clock [ns], references and outputs that wait for each other.
-        self._waiting: tuple[deque[int], deque[float], deque[Output]] = deque(), deque(), deque()
+        self._waiting: tuple[deque[int], deque[Mapping[str, float]], deque[Output]] = (
+            deque(), deque(), deque())
         self._around = Neighbours(), Timing(p.sample_period)  # at the newest look at the graph
         self._ending: Timer | None = None  # sends the commands of on_timeout
         to = self._io.topics
@@ -225,11 +226,11 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
         self._executor.close()
 
     def _on_reference(self, y_m: Mapping[str, float], *_: object) -> None:
-        if self.configured:
+        if self.configured and self.settings.lockstep:
+            self._waiting[1].append(y_m)
+            self._answer_waiting()
+        elif self.configured:
             self.loops.take_references(y_m)
-            if self.settings.lockstep:
-                self._waiting[1].append(self.loops.by_name[''].heard.y_m)
-                self._answer_waiting()
 
     def _on_report(self, applied: Mapping[str, float], info: dict[str, Any], _: object) -> None:
         for joint, v in applied.items():
@@ -266,7 +267,8 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
             output = outputs.popleft()._replace(
                 sequence=sample_counter.UNNUMBERED, stamp_ns=ticks.popleft()
             )
-            if steps := self.loops.answer({'': output}, references.popleft()):
+            self.loops.take_references(references.popleft())
+            if steps := self.loops.answer({'': output}):
                 self.loops.by_name[''].core.refine()
                 self._follow_up(steps)
 

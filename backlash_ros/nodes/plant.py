@@ -14,7 +14,7 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
-from backlash_ros.core.loop.command_history import HeldControl
+from backlash_ros.core.loop.command_history import CommandHistory
 from backlash_ros.core.parameters import PLANT, Parameters
 from backlash_ros.core.scenario import build_plant
 from backlash_ros.nodes.runtime import messages
@@ -36,7 +36,8 @@ class PlantNode(ProcessNode):
         self._plant = build_plant(p)
         # The same draws as in a simulation in one process, so that runs agree to the last bit.
         self._loss_rng = np.random.default_rng([p.seed, 1])
-        self._held = HeldControl()  # times of arrival on the monotonic clock
+        self._commands = CommandHistory(p.sample_period)  # that came, by the monotonic clock
+        self._commands.publish(0.0, 0)
         self._expecting = False  # no v has come since the newest output
         self._published: Counter[str] = Counter()  # what a recorder can have heard
         self._applied, self._output = (
@@ -81,7 +82,7 @@ class PlantNode(ProcessNode):
         v = message.data
         if not isfinite(v):
             return
-        self._held.take(v, messages.arrival_ns(info['received_timestamp']))
+        self._commands.publish(v, messages.arrival_ns(info['received_timestamp']))
         expected, self._expecting = self._expecting, False
         if expected and self.settings.lockstep:
             self._answer(v)
@@ -89,7 +90,7 @@ class PlantNode(ProcessNode):
     def _answer(self, *acted: float) -> None:
         """Lockstep: go on to the next output that is not lost on purpose."""
         while not self._go_on(acted):
-            acted = (self._held.newest,)
+            acted = (self._commands.at(inf)[0],)
 
     def _keep_time(self, executor: PromptExecutor) -> None:
         """Real time: go on at absolute deadlines."""
@@ -108,7 +109,7 @@ class PlantNode(ProcessNode):
                 # Some of these intervals may have been over before v came; all that has come so far
                 # came within the newest one. Later than latest_ns y would look like the next one.
                 self._go_on([
-                    self._held.over(due_ns - missed * period_ns if missed else inf)
+                    self._commands.at(due_ns - missed * period_ns if missed else inf)[0]
                     for missed in reversed(range(passed))
                 ], latest_ns=due_ns + 0.75 * period_ns)
                 executor.look_if_due()

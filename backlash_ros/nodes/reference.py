@@ -92,14 +92,14 @@ class ReferenceNode(ProcessNode):
                             f'{self._io.topics.output} is not heard here, but by the controller: '
                             'y_m goes by the own clock; start the driver some seconds before'
                         )
-            if pace.listens(now):
+            if now >= pace.due_s:
                 serve_polled(outputs)
                 now = time.monotonic()
                 sample = pace.sample_to_send(now)
                 if sample is not None:
                     self._publish(sample)
             # An output that is late is looked for often: y_m leaves as soon as it is there.
-            wake_at = now + 0.05 * p.sample_period if pace.listens(now) else pace.look_s(now)
+            wake_at = pace.due_s if now < pace.due_s else now + 0.05 * p.sample_period
             time.sleep(max(min(wake_at, serve_at) - now, 0.0))
             now = time.monotonic()
 

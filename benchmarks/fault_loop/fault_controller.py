@@ -10,7 +10,7 @@ from fault_loop.fault_world import Actuator, Driver, Sensor
 from backlash_ros.core import Estimate, Parameters
 from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.control.limits import Limits
-from backlash_ros.core.loop.control_loop import ControlLoop
+from backlash_ros.core.loop.control_loop import ControlLoop, Phase
 from backlash_ros.core.loop.control_loop import Driver as Asked
 from backlash_ros.core.loop.diagnosis import Level, Neighbours, figures_of_loop, findings_of
 from backlash_ros.core.loop.loop_statistics import Lately
@@ -90,7 +90,8 @@ class Controller:
             output = o._replace(
                 stamp_ns=o.stamp_ns - of_stamps_ns, sent_ns=o.sent_ns - of_stamps_ns,
                 received_ns=o.received_ns - self._clock.set_ns)
-            begins, core = loop.begins, loop.core
+            core = loop.core
+            begins = loop.phase in (Phase.BEGINS, Phase.SILENT)
             step = loop.answer(output)
             if step is not None:
                 self.note(step, begins or loop.core is not core)

@@ -163,7 +163,7 @@ class CommandHistory:
         latest_ns = min(due_ns, end_ns) - self._transit_ns
         times_ns = [latest_ns - i * self._period_ns for i in range(intervals - 1, -1, -1)]
         self.counts.late += self._published[-1][0] >= times_ns[0]
-        acted, others = zip(*map(self._at, times_ns), strict=True)
+        acted, others = zip(*map(self.at, times_ns), strict=True)
         return list(acted), list(others)
 
     def newest_report(self, end_ns: int) -> float:
@@ -194,7 +194,7 @@ class CommandHistory:
         self.counts.unreported += not complete
         return reports if complete else []
 
-    def _at(self, time_ns: float) -> tuple[float, float]:
+    def at(self, time_ns: float) -> tuple[float, float]:
         """The newest v that had left by then, and the one beside it that may have been in use."""
         later_ns, later = inf, nan
         for i in range(len(self._published) - 1, -1, -1):
@@ -208,21 +208,6 @@ class CommandHistory:
                 return v, older if since <= until else later
             later_ns, later = stamp_ns, v
         return self._published[0][1], nan
-
-
-class HeldControl:
-    """The newest v acts from its arrival on; before, the one before it."""
-
-    def __init__(self) -> None:
-        self.newest = 0.0
-        self._before, self._arrived_ns = 0.0, 0
-
-    def take(self, v: float, arrived_ns: int) -> None:
-        self._before, self.newest, self._arrived_ns = self.newest, v, arrived_ns
-
-    def over(self, ended_ns: float) -> float:
-        """The v of a sample period that ended then: it counts for all of it if it came in it."""
-        return self.newest if self._arrived_ns < ended_ns else self._before
 
 
 def v_of_intervals(index: NDArray[np.int64], output_ns: Stamps, command_ns: Stamps, v: Array,

@@ -101,10 +101,6 @@ class ControlLoop:
         return self.core.motion.v
 
     @property
-    def begins(self) -> bool:
-        return self.phase in (Phase.BEGINS, Phase.SILENT)
-
-    @property
     def silent(self) -> bool:
         return self.phase is Phase.SILENT
 
@@ -128,17 +124,14 @@ class ControlLoop:
         else:
             self.statistics.bad_reports += 1
 
-    def answer(self, output: Output, arrival: Arrival | None = None,
-               y_m: float | None = None) -> ControlStep | None:
+    def answer(self, output: Output, arrival: Arrival | None = None) -> ControlStep | None:
         """Count y(k), learn from it, and send v(k); None where the message brings no command.
 
-        arrival: of an output that was counted already. y_m: None for the newest one.
+        arrival: of an output that was counted already.
         """
-        arrival = arrival or self.counter.count(*output.counted)
-        y_m = self.heard.y_m if y_m is None else y_m
-        if not self._is_usable(output, arrival, y_m):
+        if not self._is_usable(output, arrival or self.counter.count(*output.counted)):
             return None
-        step = self._step_core(output.y, y_m, output.stamp_ns)
+        step = self._step_core(output.y, self.heard.y_m, output.stamp_ns)
         self.send(step.v)
         took_s = (self.driver.wall_ns() - output.sent_ns) * 1e-9
         self.statistics.note(output.y, step.v, self.core.inverse.limited,
@@ -160,7 +153,7 @@ class ControlLoop:
             self._send(v)
             self.commands.publish(v, self.driver.now_ns())
 
-    def _is_usable(self, output: Output, arrival: Arrival, y_m: float) -> bool:
+    def _is_usable(self, output: Output, arrival: Arrival) -> bool:
         """Count a message of y; returns whether there is a command to be made of it."""
         statistics = self.statistics
         if self.standing_down or not arrival.is_sample:
@@ -171,7 +164,7 @@ class ControlLoop:
             self._note_missing(arrival)
         if plausible(output.y):
             self.heard.y_at = self.driver.steady_s()
-            if plausible(y_m):
+            if plausible(self.heard.y_m):
                 return self._may_answer(output)
             statistics.without_reference += 1
         else:
@@ -349,8 +342,7 @@ class JointLoops:
         pause = max(round(0.05 / p.sample_period / len(self.loops)), 1)  # samples
         self.turns = cycle([turn for loop in self.loops for turn in (loop, *[None] * (pause - 1))])
 
-    def answer(self, outputs: Mapping[str, Output],
-               y_m: float | None = None) -> dict[str, ControlStep]:
+    def answer(self, outputs: Mapping[str, Output]) -> dict[str, ControlStep]:
         """Send v(k) for y(k) of all joints that there are; returns the steps that were made."""
         arrival = self.counter.count(*next(iter(outputs.values())).counted)
         lost = self._together and any(
@@ -362,7 +354,7 @@ class JointLoops:
         for joint, loop in self.by_name.items():
             if joint not in outputs:
                 loop.skip(arrival)
-            elif (step := loop.answer(outputs[joint], arrival, y_m)) is not None:
+            elif (step := loop.answer(outputs[joint], arrival)) is not None:
                 steps[joint] = step
         self._send_waiting()
         # What the next commands need not wait for then.

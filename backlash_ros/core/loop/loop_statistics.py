@@ -9,34 +9,26 @@ import numpy as np
 
 
 @dataclass
-class MessageCounts:
-    """Messages that were not as they should be."""
+class Counts:
+    """Samples and messages, since a loop began or lately."""
 
     without_reference: int = 0  # outputs before the first y_m
     bad_outputs: int = 0  # values of y that are no finite number
     bad_references: int = 0  # ... and of y_m
     bad_reports: int = 0  # ... and of applied_control
     extra: int = 0  # outputs that were repeated, too early, old or of a second driver
-
-    @property
-    def dropped(self) -> int:
-        """Messages that held no finite number."""
-        return self.bad_outputs + self.bad_references + self.bad_reports
-
-
-@dataclass
-class Counts(MessageCounts):
-    """Samples and messages, since a loop began or lately."""
-
     used: int = 0  # outputs that brought a command
     lost: int = 0  # outputs that never arrived
     unsent: int = 0  # of these, the ones that the driver never published
     late: int = 0  # commands that missed their sample
     unreported: int = 0  # outputs without a matching report while reports are used
-    interruptions: int = 0  # times that the driver was silent or restarted
     limited: int = 0  # commands that met a limit
     wraps: int = 0  # times that y jumped by 2 pi
-    dead_workers: int = 0  # processes for fits that died
+
+    @property
+    def dropped(self) -> int:
+        """Messages that held no finite number."""
+        return self.bad_outputs + self.bad_references + self.bad_reports
 
     @property
     def heard(self) -> int:
@@ -51,11 +43,13 @@ class Counts(MessageCounts):
 class LoopStatistics(Counts):
     """Counts since the loop began, and what tells how well it runs now.
 
-    still: newest values of y in a row that are equal within still_band; still_v: lowest and highest
-    v meanwhile. v_range: those since they were asked for. inconsistent: newest samples in a row
-    that contradict the estimate. latencies [s]: the newest ones, as topics.py defines them.
+    interruptions: times that the driver was silent or restarted. still: newest values of y in a row
+    that are equal within still_band; still_v: lowest and highest v meanwhile. v_range: those since
+    they were asked for. inconsistent: newest samples in a row that contradict the estimate.
+    latencies [s]: the newest ones, as topics.py defines them.
     """
 
+    interruptions: int = 0
     still_band: float = 0.0
     still: int = 0
     still_v: tuple[float, float] = (inf, -inf)

@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Sequence
-from itertools import islice, pairwise
+from itertools import islice
 from math import inf, isfinite, nan, sqrt
 from typing import NamedTuple
 
@@ -112,14 +112,12 @@ class DriverPeriod:
             self.period_ns = 1e9 * (found.mean if off else nominal_s)
 
     def timing(self) -> Timing:
-        intervals = sorted(later - earlier for earlier, later in pairwise(self._messages_ns))
-        low = mean = high = nan
-        if len(intervals) >= 20:
-            tenth = len(intervals) // 10
-            low, high = 1e-9 * intervals[tenth], 1e-9 * intervals[-1 - tenth]
-            mean = 1e-9 * sum(intervals) / len(intervals)
+        intervals = 1e-9 * np.sort(np.diff(self._messages_ns)) if len(self._messages_ns) > 20 \
+            else np.full(1, nan)
+        tenth = len(intervals) // 10
+        shares = float(intervals[tenth]), float(intervals.mean()), float(intervals[-1 - tenth])
         age_s = float(np.median(self._ages_s)) if len(self._ages_s) >= 20 else nan
-        return Timing(self.nominal_s, self.newest(), (low, mean, high), age_s)
+        return Timing(self.nominal_s, self.newest(), shares, age_s)
 
     def newest(self, intervals: int = 1000) -> Period:
         """The period over so many intervals at most: the slope of the stamps over their samples.
@@ -332,7 +330,8 @@ class ReferencePace:
     y_m(k+1) leaves half a period after y(k) was due, or as soon as a late y(k) is there; without
     outputs it goes on by the own clock. At most one leaves per period, and none for the same sample
     twice once the first output has come. waits: y_m(0) is repeated until then. own_clock: False on
-    simulated time, which may run at any speed: the newest y_m is repeated.
+    simulated time, which may run at any speed: the newest y_m is repeated. due_s: when to look for
+    an output, and to wait for one if none is there.
     """
 
     def __init__(self, period_s: float, waits: bool, now_s: float, own_clock: bool = True) -> None:
@@ -342,7 +341,7 @@ class ReferencePace:
         self._offset = 0  # sample of y_m that follows the newest output, less its index
         self._next = 0  # sample that follows the newest output
         self._sent = -1
-        self._due_s = now_s
+        self.due_s = now_s
 
     def hear(self, index: int, at_s: float) -> None:
         if self._heard_s == -inf:
@@ -352,43 +351,30 @@ class ReferencePace:
         self._next = index + self._offset
         self._fresh, self._heard_s, self.waits = True, at_s, False
 
-    def listens(self, now_s: float) -> bool:
-        """Whether it is time to look for an output, and to wait for one if none is there."""
-        return now_s >= self._due_s
-
-    def look_s(self, now_s: float) -> float:
-        """When there is something to do at the latest."""
-        return self._due_s if now_s < self._due_s else self._give_up_s
-
     def sample_to_send(self, now_s: float) -> int | None:
         """The sample whose y_m has to leave now; None where it is not time yet."""
         period, sample = self._period_s, self._next
-        if now_s < self._due_s:
+        if now_s < self.due_s:
             return None
         if self._heard_s == -inf:
             # Messages that were due while the process was held up are not made up for.
-            self._due_s = max(self._due_s, now_s - 0.5 * period) + period
+            self.due_s = max(self.due_s, now_s - 0.5 * period) + period
             self._next += not self.waits
             self._sent = sample
             return sample
         if self._fresh:
             self._fresh = False
-            self._due_s = self._heard_s + 1.5 * period
-        elif now_s < self._give_up_s:
-            return None
+            self.due_s = self._heard_s + 1.5 * period
+        elif now_s < self._heard_s + (1.0 + JITTER) * period:
+            return None  # an output that has not come yet does not count as lost
         elif not self._own_clock:
-            self._due_s = now_s + period
+            self.due_s = now_s + period
             return sample
         else:
             missing = max(int((now_s - self._heard_s) / period - JITTER), 1)
-            self._due_s = self._heard_s + (1 + missing + JITTER) * period
+            self.due_s = self._heard_s + (1 + missing + JITTER) * period
             sample += missing
         if sample <= self._sent:
             return None
-        self._sent, self._due_s = sample, max(self._due_s, now_s + 0.5 * period)
+        self._sent, self.due_s = sample, max(self.due_s, now_s + 0.5 * period)
         return sample
-
-    @property
-    def _give_up_s(self) -> float:
-        # When an output that has not come yet counts as lost.
-        return max(self._due_s, self._heard_s + (1.0 + JITTER) * self._period_s)

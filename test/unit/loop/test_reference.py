@@ -94,7 +94,7 @@ def messages_of(
     waiting, sent = list(arrivals_s), []
     now = 0.0
     while now < end_s:
-        if not sleeps or pace.listens(now):
+        if not sleeps or now >= pace.due_s:
             heard = [at for at in waiting if at <= now]
             waiting = waiting[len(heard):]
             for at in heard:

@@ -291,11 +291,11 @@ def test_of_two_senders_one_is_used_from_the_start(first, second, offset, number
 ])
 def test_control_acts_from_its_arrival_though_the_plant_was_held_up(periods_ago, applied):
     now_ns = 100 * PERIOD_NS
-    held = command_history.HeldControl()
+    commands = command_history.CommandHistory(PERIOD_S)
     for v, ago in ((1.0, 9.0), (2.0, periods_ago)):
-        held.take(v, now_ns - int(ago * PERIOD_NS))
+        commands.publish(v, now_ns - int(ago * PERIOD_NS))
     ended_ns = [now_ns - 1.5 * PERIOD_NS, now_ns - 0.5 * PERIOD_NS, inf]
-    assert ([held.over(each) for each in ended_ns], held.newest) == (applied, 2.0)
+    assert [commands.at(each)[0] for each in ended_ns] == applied
 
 
 def told(

@@ -112,7 +112,8 @@ def test_sections_that_do_not_reach_their_node_are_named(sections, full_name, re
 def test_a_sample_has_a_value_of_every_label_and_bands_of_two_deviations() -> None:
     p = Parameters()
     loop = ControlLoop(p, lambda v: None, Driver(lambda: 0), None, SampleCounter(p.sample_period))
-    made = loop.answer(Output(0.5, 0, 0, 0, 0), y_m=1.0)
+    loop.take_reference(1.0)
+    made = loop.answer(Output(0.5, 0, 0, 0, 0))
     assert made is not None
     e = Estimate(1.3, 3.0, -2.0, 0.2, 0.05, 0.1, 0.3, Status.TRACKING)
     values = labelled(loop, made._replace(estimate=e))
