@@ -12,11 +12,8 @@ from typing import Any
 
 from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
-from rclpy.time import Time
 from rclpy.timer import Timer
-from rosgraph_msgs.msg import Clock
 
-from backlash_ros import topics
 from backlash_ros.core import assembly
 from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.jobs import Executor, WorkerExecutor
@@ -94,7 +91,7 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
 
         self.every(DIAGNOSTICS_PERIOD_S / len(self.joints), look_and_tell)
         if p.lockstep:
-            self.create_subscription(Clock, topics.CLOCK, self._on_clock, KEPT_QOS)
+            self.listen_to_clock(self._on_tick, KEPT_QOS)
         else:
             self.every(0.1, self._look_for_silence)
         for joint in self.joints:
@@ -236,8 +233,8 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
         for joint, v in applied.items():
             self.loops.by_name[joint].take_applied(v, self._io.stamp_ns(info))
 
-    def _on_clock(self, message: Clock) -> None:
-        self._waiting[0].append(Time.from_msg(message.clock).nanoseconds)
+    def _on_tick(self, time_ns: int) -> None:
+        self._waiting[0].append(time_ns)
         self._answer_waiting()
 
     def _on_output(self, outputs: Mapping[str, Output]) -> None:

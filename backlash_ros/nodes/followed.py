@@ -11,7 +11,7 @@ from functools import partial
 from math import inf, nan
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.subscription import Subscription
 from std_msgs.msg import Float64
 
@@ -19,7 +19,7 @@ from backlash_ros.nodes.runtime.executor import serve_polled
 from backlash_ros.nodes.runtime.messages import SILENT_S
 from backlash_ros.nodes.runtime.process import ProcessNode
 from backlash_ros.options import OptionParser
-from backlash_ros.topics import BACKLASH, DIAGNOSTICS
+from backlash_ros.topics import BACKLASH
 
 
 class ControllerState:
@@ -40,15 +40,14 @@ class ControllerState:
         self.estimates = dict.fromkeys(BACKLASH, (nan, nan))
         self.events: deque[tuple[str, str]] = deque(maxlen=20)
 
-    def hear(self, status: DiagnosticStatus, now_s: float) -> None:
+    def hear(self, message: str, level: int, values: dict[str, str], now_s: float) -> None:
         """Take in what /diagnostics says of it; a text that has changed is an event."""
         # A text in which a figure has changed tells nothing new.
-        before, after = (re.sub(r'[\d.]+', '', text) for text in (self.message, status.message))
+        before, after = (re.sub(r'[\d.]+', '', text) for text in (self.message, message))
         if after != before:
-            self.note(status.message)
-        self.message, self._level = status.message, min(ord(status.level), 2)
-        self._heard_at_s = now_s
-        self.values = {pair.key: pair.value for pair in status.values}
+            self.note(message)
+        self.message, self._level = message, min(level, 2)
+        self._heard_at_s, self.values = now_s, values
         for name in BACKLASH:
             self.estimates[name] = self.number(name), 2.0 * self.number(f'std_{name}')
 
@@ -107,10 +106,7 @@ class ViewerNode(ProcessNode):
         self.awaited = f'waiting for a controller{which} in ROS_DOMAIN_ID=' \
             f'{self.context.get_domain_id()}: bringup prints which one it uses'
         self.states: dict[str, ControllerState] = {}
-        # Those of all nodes of the domain: some robots have many.
-        self._diagnostics = self.listen(
-            DiagnosticArray, DIAGNOSTICS, self._hear, qos=100, polled=True
-        )
+        self._diagnostics = self.listen_to_diagnostics(self._hear)
         self.every(1.0, self._find)
         self._find()
 
@@ -122,10 +118,9 @@ class ViewerNode(ProcessNode):
             for subscription in state.subscriptions:
                 serve_polled(subscription)
 
-    def _hear(self, message: DiagnosticArray, info: dict[str, Any]) -> None:
-        for status in message.status:
-            if state := self.states.get(f'/{status.name}'):
-                state.hear(status, time.monotonic())
+    def _hear(self, status: DiagnosticStatus, values: dict[str, str], received_ns: int) -> None:
+        if state := self.states.get(f'/{status.name}'):
+            state.hear(status.message, ord(status.level), values, time.monotonic())
 
     def _find(self) -> None:
         """Whoever publishes what a controller publishes is one."""

@@ -14,8 +14,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
-from rclpy.time import Time
-from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray
 
 from backlash_ros import topics
@@ -26,7 +24,7 @@ from backlash_ros.core.parameters import RECORDER
 from backlash_ros.nodes.runtime import messages
 from backlash_ros.nodes.runtime.driver_io import driver_topics, output_qos
 from backlash_ros.nodes.runtime.executor import PromptExecutor
-from backlash_ros.nodes.runtime.process import ENABLED, ProcessNode, emit, run
+from backlash_ros.nodes.runtime.process import ProcessNode, emit, run
 from backlash_ros.options import BAD_INPUT, FAILED
 
 RECORDER_DEPTH = 10_000  # messages that may wait while the disk is slow
@@ -74,9 +72,8 @@ class RecorderNode(ProcessNode):
             kept = topic == topics.MODEL
             self._record(topic, kind, messages.KEPT_QOS if kept else RECORDER_DEPTH)
         if p.lockstep:
-            self.create_subscription(Clock, topics.CLOCK, self._on_clock, RECORDER_DEPTH)
-        if ENABLED:
-            self.every(0.2, self._tell)
+            self.listen_to_clock(self._on_tick, RECORDER_DEPTH)
+        self.every(0.2, self._tell)
 
     def work(self, executor: PromptExecutor) -> None:
         p, to = self.settings, driver_topics(self.settings)
@@ -178,8 +175,8 @@ class RecorderNode(ProcessNode):
         self._with_bag(lambda bag: bag.write(channel.connection, stamp_ns, message))
         self._unrecorded += self._bag is None
 
-    def _on_clock(self, message: Clock) -> None:
-        self._now_ns = Time.from_msg(message.clock).nanoseconds
+    def _on_tick(self, time_ns: int) -> None:
+        self._now_ns = time_ns
 
     def _tell(self) -> None:
         """Say how the run is going, of its first joint if it has several."""

@@ -5,11 +5,8 @@ import time
 from collections.abc import Mapping
 from functools import partial
 from math import inf
-from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.time import Time
-from rosgraph_msgs.msg import Clock
+from diagnostic_msgs.msg import DiagnosticStatus
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
@@ -45,13 +42,16 @@ class ReferenceNode(ProcessNode):
                       f'{p.waveform}, sample_period {p.sample_period:g} s')
 
     def work(self, executor: PromptExecutor) -> None:
-        wanted = self.settings.wait_for_subscribers
+        p, wanted = self.settings, self.settings.wait_for_subscribers
         if self.wait_until(executor, lambda: self._output.get_subscription_count() >= wanted,
                            f'{wanted} subscribers of {topics.REFERENCE}'):
-            if self.settings.lockstep:
-                self.create_subscription(Clock, topics.CLOCK, self._on_clock, messages.KEPT_QOS)
+            if p.lockstep:
+                self.listen_to_clock(
+                    lambda time_ns: self._publish(round(time_ns * 1e-9 / p.sample_period)),
+                    messages.KEPT_QOS,
+                )
             emit('ready')
-            if not self.settings.lockstep:
+            if not p.lockstep:
                 self._follow(executor)
         super().work(executor)
 
@@ -74,9 +74,7 @@ class ReferenceNode(ProcessNode):
                 pace.hear(counter.index, messages.arrival_ns(received_ns) * 1e-9)
 
         outputs = self._io.listen(hear, depth=1, polled=True)
-        diagnostics = self.listen(
-            DiagnosticArray, topics.DIAGNOSTICS, self._hear_diagnostics, 10, polled=True
-        )
+        diagnostics = self.listen_to_diagnostics(self._hear_diagnostics)
         serve_at = now
         while not self.stopping:
             if now >= serve_at:
@@ -103,11 +101,12 @@ class ReferenceNode(ProcessNode):
             time.sleep(max(min(wake_at, serve_at) - now, 0.0))
             now = time.monotonic()
 
-    def _hear_diagnostics(self, message: DiagnosticArray, info: dict[str, Any]) -> None:
+    def _hear_diagnostics(
+        self, status: DiagnosticStatus, values: Mapping[str, str], received_ns: int,
+    ) -> None:
         """Note when the controller of this loop has used samples."""
         loop = self.settings.io.joint or self.resolve_topic_name(self._io.topics.control)
-        if any(value.key == 'samples' and value.value != '0' for status in message.status
-               if status.hardware_id == loop for value in status.values):
+        if status.hardware_id == loop and values.get('samples', '0') != '0':
             self._loop_runs_at = min(self._loop_runs_at, time.monotonic())
 
     def check_change(self, p: Parameters) -> None:
@@ -120,10 +119,6 @@ class ReferenceNode(ProcessNode):
         if self._signal.waveform in PERIODIC:
             phase = before.frequency * t
             self._offset_s = phase / self._signal.frequency - self._newest * before.sample_period
-
-    def _on_clock(self, message: Clock) -> None:
-        time_s = Time.from_msg(message.clock).nanoseconds * 1e-9
-        self._publish(round(time_s / self.settings.sample_period))
 
     def _publish(self, sample: int) -> None:
         # The same product as in a simulation in one process, so that runs agree to the last bit.

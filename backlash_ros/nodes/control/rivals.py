@@ -6,12 +6,10 @@ import socket
 import time
 from collections.abc import Callable, Mapping
 from math import inf
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from backlash_ros import topics
 from backlash_ros.nodes.runtime.driver_io import DriverIo
 from backlash_ros.nodes.runtime.executor import serve_polled
 from backlash_ros.nodes.runtime.messages import SILENT_S, arrival_ns, name_of
@@ -113,8 +111,8 @@ class RivalWatch(Rivals):
         self._lock = CommandLock(node.context.get_domain_id(), self.topic)
         self._told: tuple[tuple[Rival, ...], bool] = (), False  # at the look before
         self._hello_until = -inf  # until then others are told at every look who was first
-        self._diagnostics = node.listen(
-            DiagnosticArray, topics.DIAGNOSTICS, self._hear, 100, polled=True
+        self._diagnostics = node.listen_to_diagnostics(
+            lambda _, values, received_ns: self.hear(values, 1e-9 * arrival_ns(received_ns))
         )
         node.every(0.2, self.look)
 
@@ -157,11 +155,6 @@ class RivalWatch(Rivals):
             node.log.info(f'nobody else publishes {self.topic} any more')
         if self._told != before or (others and now < self._hello_until):
             self._changed()
-
-    def _hear(self, message: DiagnosticArray, info: dict[str, Any]) -> None:
-        for status in message.status:
-            values = {each.key: each.value for each in status.values}
-            self.hear(values, 1e-9 * arrival_ns(info['received_timestamp']))
 
     def _identity_after(self, advertise: Callable[[], object]) -> str:
         """The identity of the publisher that advertise makes; rclpy has no way to ask for it."""

@@ -18,8 +18,9 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
-from rclpy.clock import Clock
+from rclpy.clock import Clock as RosClock
 from rclpy.clock_type import ClockType
 from rclpy.exceptions import NameValidationException
 from rclpy.executors import ExternalShutdownException
@@ -29,8 +30,10 @@ from rclpy.parameter import Parameter as RosParameter
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
+from rclpy.time import Time
 from rclpy.timer import Timer
 from rclpy.utilities import remove_ros_args
+from rosgraph_msgs.msg import Clock
 
 from backlash_ros.core.parameters import (
     BY_NAME,
@@ -46,6 +49,7 @@ from backlash_ros.core.parameters import (
 from backlash_ros.middleware import prefer_loopback
 from backlash_ros.nodes.runtime.executor import Polled, PromptExecutor
 from backlash_ros.options import BAD_INPUT, DONE, FAILED, OptionParser
+from backlash_ros.topics import CLOCK, DIAGNOSTICS
 
 ENABLED = os.environ.get('BACKLASH_ROS_EVENTS') == '1'
 
@@ -102,7 +106,7 @@ class ProcessNode(Node):
 
     def every(self, period_s: float, action: Callable[[], Any]) -> Timer:
         """Call action so often, on the steady clock."""
-        return self.create_timer(period_s, action, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        return self.create_timer(period_s, action, clock=RosClock(clock_type=ClockType.STEADY_TIME))
 
     def listen(
         self, message_type: type[Any], topic: str, callback: Callable[[Any, Any], None],
@@ -115,6 +119,25 @@ class ProcessNode(Node):
         return self.create_subscription(
             message_type, topic, untyped, qos, raw=raw, callback_group=group() if polled else None
         )
+
+    def listen_to_clock(self, hear: Callable[[int], object], qos: QoSProfile | int) -> None:
+        """Call hear with the simulated time of each tick [ns]."""
+        def hear_tick(tick: Clock) -> None:
+            hear(Time.from_msg(tick.clock).nanoseconds)
+
+        self.create_subscription(Clock, CLOCK, hear_tick, qos)
+
+    def listen_to_diagnostics(
+        self, hear: Callable[[DiagnosticStatus, dict[str, str], int], None],
+    ) -> Subscription:
+        """Call hear with each status, its values by key, and when it came [ns]; a polled one."""
+        def hear_all(message: DiagnosticArray, info: dict[str, Any]) -> None:
+            for status in message.status:
+                values = {each.key: each.value for each in status.values}
+                hear(status, values, info['received_timestamp'])
+
+        # Those of all nodes of the domain: some robots have many.
+        return self.listen(DiagnosticArray, DIAGNOSTICS, hear_all, 100, polled=True)
 
     def work(self, executor: PromptExecutor) -> None:
         """Do what the node is for until `stopping`."""

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from io import StringIO
 
 import pytest
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from rich.console import Console
 
 from backlash_ros.nodes.followed import ControllerState
@@ -25,9 +24,7 @@ def say(
     state: ControllerState, message: str, level: int = 0, values: Mapping[str, str] = VALUES,
     silent_s: float = 0.0,
 ) -> None:
-    state.hear(DiagnosticStatus(level=bytes([level]), message=message, values=[
-        KeyValue(key=key, value=value) for key, value in values.items()
-    ]), time.monotonic() - silent_s)
+    state.hear(message, level, {**values}, time.monotonic() - silent_s)
 
 
 def controller(
