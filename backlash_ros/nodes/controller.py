@@ -67,8 +67,7 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
             # The first command begins with what the driver reports, even if it is not learned from.
             self._io.listen_to(self._io.topics.applied, self._on_report, KEPT_COMMANDS)
         # Lockstep: ticks of /clock [ns], references and outputs that wait for each other.
-        self._waiting: tuple[deque[int], deque[Mapping[str, float]], deque[Output]] = (
-            deque(), deque(), deque())
+        self._waiting: tuple[deque[Any], ...] = deque(), deque(), deque()
         self._around = Neighbours(), Timing(p.sample_period)  # at the newest look at the graph
         self._ending: Timer | None = None  # sends the commands of on_timeout
         to = self._io.topics
@@ -91,7 +90,7 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
 
         self.every(DIAGNOSTICS_PERIOD_S / len(self.joints), look_and_tell)
         if p.lockstep:
-            self.listen_to_clock(self._on_tick, KEPT_QOS)
+            self.listen_to_clock(partial(self._pair, 0), KEPT_QOS)
         else:
             self.every(0.1, self._look_for_silence)
         for joint in self.joints:
@@ -224,8 +223,7 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
 
     def _on_reference(self, y_m: Mapping[str, float], *_: object) -> None:
         if self.configured and self.settings.lockstep:
-            self._waiting[1].append(y_m)
-            self._answer_waiting()
+            self._pair(1, y_m)
         elif self.configured:
             self.loops.take_references(y_m)
 
@@ -233,16 +231,11 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
         for joint, v in applied.items():
             self.loops.by_name[joint].take_applied(v, self._io.stamp_ns(info))
 
-    def _on_tick(self, time_ns: int) -> None:
-        self._waiting[0].append(time_ns)
-        self._answer_waiting()
-
     def _on_output(self, outputs: Mapping[str, Output]) -> None:
         if not self.active:
             return
         if self.settings.lockstep:
-            self._waiting[2].append(outputs[''])
-            self._answer_waiting()
+            self._pair(2, outputs[''])
             return
         self._io.serve_waiting()
         steps = self.loops.answer(outputs)
@@ -256,9 +249,10 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
                 turn.core.refine()
             self._follow_up(steps)
 
-    def _answer_waiting(self) -> None:
+    def _pair(self, which: int, came: int | Mapping[str, float] | Output) -> None:
         """Lockstep: answer as soon as tick, reference and output of a sample are there."""
         ticks, references, outputs = self._waiting
+        self._waiting[which].append(came)
         while self.active and all(self._waiting):
             # A tick is the sample: messages are not told apart by number then.
             output = outputs.popleft()._replace(
