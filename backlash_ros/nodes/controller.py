@@ -165,7 +165,7 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
         """Whether everybody is found that may be there: beside the driver those who hear it all."""
         lockstep, io = self.settings.lockstep, self._io
         wanted = max(self.settings.wait_for_subscribers, int(lockstep))
-        return (lockstep or self._rivals.settled) and (not wanted or (
+        return (lockstep or time.monotonic() >= self._rivals.settled_at) and (not wanted or (
             io.publisher.get_subscription_count() >= wanted
             and self._steps.listeners >= wanted - 1
             and (self.count_publishers(io.topics.reference) > 0 if lockstep

@@ -117,10 +117,6 @@ class RivalWatch(Rivals):
         node.every(0.2, self.look)
 
     @property
-    def settled(self) -> bool:
-        return time.monotonic() >= self.settled_at
-
-    @property
     def any_first(self) -> bool:
         """Whether somebody else is in charge of the actuator."""
         return self.since_ns == WAITS_NS or any(rival.was_first for rival in self.found)

@@ -3,7 +3,7 @@
 import time
 from array import array
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache, cached_property
+from functools import cache
 from math import nan
 from typing import Any, NamedTuple, cast
 
@@ -89,15 +89,12 @@ class DriverIo:
         self._node, self._p = node, p
         self._stamp = 0, 0  # in the header of the newest y, and the number of its message
         self.clock = WallClock()
+        # Whether stamps are those of /clock: the middleware has real time.
+        self.simulated_time = bool(node.get_parameter('use_sim_time').value)
         self._repeats_stamps = False  # since then the time of sending counts
         self._newest: dict[str, float] = {}  # v by joint
         self._referred = JointMessage()  # the newest message of references
         self.heard: dict[str, Subscription] = {}
-
-    @cached_property
-    def simulated_time(self) -> bool:
-        """Whether stamps are those of /clock: the middleware has real time."""
-        return bool(self._node.get_parameter('use_sim_time').value)
 
     @property
     def is_simulated(self) -> bool:
@@ -111,8 +108,10 @@ class DriverIo:
             if not self.is_simulated:
                 self._node.log.warning(line_of(joint, text))
 
-        return Driver(self.now_ns, lambda: self.has_reports and not self.is_simulated,
-                      self.topics.applied, warn_once,
+        def may_report() -> bool:
+            return self._node.count_publishers(self.topics.applied) > 0 and not self.is_simulated
+
+        return Driver(self.now_ns, may_report, self.topics.applied, warn_once,
                       wall_ns=lambda: time.time_ns() - self.clock.set_ns)
 
     def now_ns(self) -> int:
@@ -184,11 +183,6 @@ class DriverIo:
 
         self.heard[topic] = self._node.listen(kind, topic, hear_content, qos, True, polled)
         return self.heard[topic]
-
-    @property
-    def has_reports(self) -> bool:
-        reports = self.heard.get(self.topics.applied)
-        return reports is not None and reports.get_publisher_count() > 0
 
     def serve_waiting(self) -> None:
         """Hear the references and reports that have come; not in lockstep, where nothing waits."""

@@ -10,7 +10,7 @@ from typing import Any, cast
 from lifecycle_msgs.srv import ChangeState
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.exceptions import InvalidHandle
-from rclpy.executors import ShutdownException, SingleThreadedExecutor, TimeoutException
+from rclpy.executors import SingleThreadedExecutor, TimeoutException
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.subscription import Subscription
@@ -136,7 +136,7 @@ class PromptExecutor(SingleThreadedExecutor):
         while True:
             try:
                 handler, _, _ = self.wait_for_ready_callbacks(timeout_sec=0.0)
-            except (ShutdownException, TimeoutException):
+            except TimeoutException:
                 return False
             handler()
             # What waits for something, as a service for the disk, is looked at again next time.

@@ -23,7 +23,6 @@ from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock as RosClock
 from rclpy.clock_type import ClockType
 from rclpy.exceptions import NameValidationException
-from rclpy.executors import ExternalShutdownException
 from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
@@ -103,6 +102,10 @@ class ProcessNode(Node):
     @property
     def stopping(self) -> bool:
         return bool(self.signals)
+
+    def count_publishers(self, topic_name: str) -> int:
+        # rclpy would count by the name before it is remapped.
+        return super().count_publishers(self.resolve_topic_name(topic_name))
 
     def every(self, period_s: float, action: Callable[[], Any]) -> Timer:
         """Call action so often, on the steady clock."""
@@ -266,8 +269,7 @@ def run(
             # A full collection would look through all of numpy and scipy and cost many samples.
             gc.collect()
             gc.freeze()
-            with contextlib.suppress(ExternalShutdownException):
-                node.work(executor)
+            node.work(executor)
             code = DONE
         finally:
             node.finish()
