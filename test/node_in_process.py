@@ -37,9 +37,11 @@ NOISE = 1e-3
 
 
 @contextmanager
-def node_with(values: dict[str, object], domain: int) -> Iterator[ControllerNode]:
+def node_with(
+    values: dict[str, object], domain: int, *remapped: str,
+) -> Iterator[ControllerNode]:
     """A controller node in this process; it begins unconfigured with autostart: False."""
-    arguments = ['--ros-args', '--log-level', values.pop('log', 'fatal')]
+    arguments = ['--ros-args', '--log-level', values.pop('log', 'fatal'), *remapped]
     for name, value in values.items():
         text = str(value).lower() if isinstance(value, bool) else str(value)
         arguments += ['-p', f'{name}:={text.replace("inf", ".inf")}']

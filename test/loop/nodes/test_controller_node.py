@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from lifecycle_msgs.msg import Transition
-from node_in_process import Bench, bench, look_for_silence
+from node_in_process import Bench, bench, look_for_silence, node_with
 from std_srvs.srv import Trigger
 
 from backlash_ros.core.loop.control_loop import Phase
+from backlash_ros.tools.bringup.supervisor import free_domain
 
 RATE_MAX = 400.0
 STEP = RATE_MAX * 0.01 * (1.0 + 1e-9)
@@ -208,3 +209,8 @@ def test_all_but_the_interface_may_change_while_unconfigured(tmp_path: Path) -> 
         made.run(300)
         assert made.trigger('save_estimates').success
         assert file.exists()
+
+
+def test_who_publishes_a_remapped_topic_is_counted() -> None:
+    with free_domain() as domain, node_with({}, domain, '-r', 'control:=/motor/v') as node:
+        assert node.count_publishers('control') == node.count_publishers('/motor/v') == 1

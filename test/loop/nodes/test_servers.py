@@ -17,7 +17,6 @@ from std_srvs.srv import Trigger
 
 from backlash_ros.nodes.live import HOST, PageServer
 from backlash_ros.nodes.runtime.executor import PromptExecutor
-from backlash_ros.nodes.runtime.process import ProcessNode
 from backlash_ros.tools.bringup.supervisor import free_domain
 
 
@@ -104,14 +103,3 @@ def test_a_flood_of_messages_stops_neither_timers_nor_services(loop: Loop) -> No
     loop.spin_until(answered.done, 'an answer')
     assert answered.result().success
     assert ticks[-1] > ticks[0]  # the messages went on as well
-
-
-def test_who_publishes_a_remapped_topic_is_counted() -> None:
-    with free_domain() as domain:
-        rclpy.init(args=['--ros-args', '-r', 'control:=/motor/v'], domain_id=domain)
-        try:
-            node = ProcessNode('plant')
-            node.create_publisher(Float64, 'control', 1)
-            assert node.count_publishers('control') == node.count_publishers('/motor/v') == 1
-        finally:
-            rclpy.try_shutdown()
