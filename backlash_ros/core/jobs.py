@@ -7,7 +7,6 @@ for its result; neither waits for a job.
 import os
 import pickle
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -15,11 +14,10 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from importlib import import_module
-from io import BufferedRWPair
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Event, Thread
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 Job = Callable[..., Any]
 
@@ -89,23 +87,20 @@ class WorkerExecutor(Executor):
 
     One that dies is replaced, and only the job that was under way is lost. It ends with its parent,
     however that ends, and imports nothing of that program but what jobs need. preload: modules that
-    it imports at its start, not with its first job. loops: how many it works for.
+    it imports at its start, not with its first job. loops: how many it works for. worker: the
+    process; pickled jobs go to its standard input, pickled results come from its standard output.
     """
 
     def __init__(self, preload: Sequence[str] = (), loops: int = 1) -> None:
         self.restarts, self._arguments = 0, (tuple(preload), loops)
         self._submitted: SimpleQueue[tuple[Channel, bytes] | None] = SimpleQueue()
         self._closed = Event()
-        self._worker: Worker | None = None
+        self.worker: subprocess.Popen[bytes] | None = None
         self._thread: Thread | None = None
-
-    @property
-    def pid(self) -> int | None:
-        return None if self._worker is None else self._worker.process.pid
 
     def open(self) -> Channel:
         if self._thread is None:
-            self._worker = _start(*self._arguments)
+            self.worker = _start(*self._arguments)
             self._thread = Thread(target=self._exchange, daemon=True)
             self._thread.start()
         return super().open()
@@ -117,9 +112,9 @@ class WorkerExecutor(Executor):
         self._closed.set()
         self._submitted.put(None)
         while self._thread is not None and self._thread.is_alive():
-            worker = self._worker
+            worker = self.worker
             if worker is not None:
-                worker.process.kill()
+                worker.kill()
             self._thread.join(0.1)
 
     def _exchange(self) -> None:
@@ -129,10 +124,11 @@ class WorkerExecutor(Executor):
             asked = False
             while not (asked or channel.closed or self._closed.is_set()):
                 try:
-                    self._worker = self._worker or _start(*self._arguments)
-                    _send(self._worker.stream, job)
+                    self.worker = self.worker or _start(*self._arguments)
+                    assert self.worker.stdin and self.worker.stdout
+                    _send(self.worker.stdin, job)
                     asked = True
-                    body = pickle.load(self._worker.stream)
+                    body = pickle.load(self.worker.stdout)
                     # Not here, where it would keep the loop waiting.
                     channel.result, deaths = partial(pickle.loads, body), 0
                 # Of a start: no memory, or no more processes.
@@ -146,46 +142,33 @@ class WorkerExecutor(Executor):
         self._end_worker()
 
     def _end_worker(self) -> None:
-        worker, self._worker = self._worker, None
+        worker, self.worker = self.worker, None
         if worker is not None:
-            worker.process.kill()
-            worker.process.wait()
-            with suppress(OSError):  # of what could not be sent any more
-                worker.stream.close()
+            with suppress(OSError), worker:  # of what could not be sent any more
+                worker.kill()
 
 
-class Worker(NamedTuple):
-    """A worker process, and where pickled jobs go and pickled results come from."""
-
-    process: subprocess.Popen[bytes]
-    stream: BufferedRWPair
-
-
-def _start(preload: tuple[str, ...], loops: int) -> Worker:
-    own_end, other_end = socket.socketpair()
-    handle = other_end.fileno()
+def _start(preload: tuple[str, ...], loops: int) -> subprocess.Popen[bytes]:
     code = f'import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve; ' \
-        f'serve({handle}, {preload!r}, {loops})'
-    with own_end, other_end:
-        stream = own_end.makefile('rwb')
-        process = subprocess.Popen(
-            [sys.executable, '-c', code], pass_fds=[handle],
-            # In a session of its own it gets no Ctrl-C, not even while it starts, and what it takes
-            # of a processor is not taken from the share of the loop.
-            start_new_session=True,
-            # A second thread of a fit would take the core on which the loop runs.
-            env={**os.environ, 'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'},
-        )
+        f'serve({preload!r}, {loops})'
+    process = subprocess.Popen(
+        [sys.executable, '-c', code], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        # In a session of its own it gets no Ctrl-C, not even while it starts, and what it takes of
+        # a processor is not taken from the share of the loop.
+        start_new_session=True,
+        # A second thread of a fit would take the core on which the loop runs.
+        env={**os.environ, 'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'},
+    )
     # From here, so that it holds for its imports as well; a loop in real time passes that on.
     os.sched_setscheduler(process.pid, os.SCHED_OTHER, os.sched_param(0))
     niceness = os.getpriority(os.PRIO_PROCESS, 0) + 5
     os.setpriority(os.PRIO_PROCESS, process.pid, niceness)
     with suppress(OSError):  # a kernel that does not share the processors between sessions
         Path(f'/proc/{process.pid}/autogroup').write_text(str(niceness))
-    return Worker(process, stream)
+    return process
 
 
-def _send(stream: BufferedRWPair, body: bytes) -> None:
+def _send(stream: IO[bytes], body: bytes) -> None:
     """Send what was pickled, as one object to pickle: so it is read as a whole."""
     pickle.dump(body, stream, -1)
     stream.flush()
@@ -194,12 +177,13 @@ def _send(stream: BufferedRWPair, body: bytes) -> None:
 # --- in the worker ------------------------------------------------------------------------------
 
 
-def serve(handle: int, preload: Sequence[str], loops: int) -> None:
-    """Compute jobs that come through an inherited connection, until it ends."""
+def serve(preload: Sequence[str], loops: int) -> None:
+    """Compute jobs that come through the standard input, until it ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)
-    stream, requests = socket.socket(fileno=handle).makefile('rwb'), SimpleQueue[bytes]()
-    Thread(target=_receive, args=(stream, requests), daemon=True).start()
+    results, requests = os.fdopen(os.dup(1), 'wb'), SimpleQueue[bytes]()
+    os.dup2(2, 1)  # what a job prints is no result
+    Thread(target=_receive, args=(requests,), daemon=True).start()
     for name in preload:
         import_module(name)
     # Where nothing explains what a plant does, one search follows the other. On average they get
@@ -209,18 +193,18 @@ def serve(handle: int, preload: Sequence[str], loops: int) -> None:
     while True:
         job = requests.get()
         began = time.process_time()
-        _send(stream, _result_of(job))
+        _send(results, _result_of(job))
         credit_s += share * (time.monotonic() - since)
         since = time.monotonic()
         credit_s = min(credit_s, burst_s) - (time.process_time() - began)
         time.sleep(max(-credit_s / share, 0.0))
 
 
-def _receive(stream: BufferedRWPair, requests: SimpleQueue[bytes]) -> None:
-    """Read requests, also while a job is computed, and end the process with the connection."""
+def _receive(requests: SimpleQueue[bytes]) -> None:
+    """Read requests, also while a job is computed, and end the process with the last of them."""
     with suppress(EOFError, OSError, pickle.UnpicklingError):
         while True:
-            requests.put(pickle.load(stream))
+            requests.put(pickle.load(sys.stdin.buffer))
     os._exit(0)
 
 

@@ -32,7 +32,7 @@ from worker_jobs import last_for_ever
 executor = WorkerExecutor()
 channel = executor.open()
 channel.submit(last_for_ever, Path(sys.argv[1]))
-print(executor.pid, flush=True)
+print(executor.worker.pid, flush=True)
 while True:
     channel.poll()
     time.sleep(0.01)
@@ -80,6 +80,8 @@ def test_what_a_job_raises_or_cannot_return_comes_back_as_a_value(executor):
         failure = result_of(channel)
         assert isinstance(failure, Failure)
         assert failure.kind == kind
+    channel.submit(print, 'no result')
+    assert result_of(channel) is None
     channel.submit(operator.neg, 4)
     assert result_of(channel) == -4
 
@@ -94,13 +96,13 @@ def test_a_worker_imports_neither_ros_nor_the_program_that_started_it(executor):
 
 def test_a_worker_that_stands_still_holds_up_nobody(executor: WorkerExecutor) -> None:
     channel, other, values = executor.open(), executor.open(), np.arange(50_000.0)
-    os.kill(executor.pid, signal.SIGSTOP)
+    os.kill(executor.worker.pid, signal.SIGSTOP)
     # Ten times what a pipe takes: would any of these calls wait for the worker, it would for ever.
     channel.submit(checksum, values, 1.0)
     other.submit(operator.add, b'x' * 1_000_000, b'y')
     for _ in range(1000):
         assert channel.poll() is other.poll() is None
-    os.kill(executor.pid, signal.SIGCONT)
+    os.kill(executor.worker.pid, signal.SIGCONT)
     assert result_of(channel) == checksum(values, 1.0)
     assert result_of(other) == b'x' * 1_000_000 + b'y'
 
@@ -114,13 +116,13 @@ def test_a_worker_that_is_killed_costs_nothing_but_the_job_under_way(executor, t
         values = rng.standard_normal(rng.integers(0, 400))
         channel.submit(checksum, values, 1.0)
         third.submit(operator.neg, count)
-        os.kill(executor.pid, signal.SIGKILL)
+        os.kill(executor.worker.pid, signal.SIGKILL)
         failure = result_of(sleeper)
         assert isinstance(failure, Failure)
         assert failure.kind == LOST
         assert (result_of(third), result_of(channel)) == (-count, checksum(values, 1.0))
         assert executor.restarts == count
-        assert executor.pid is not None
+        assert executor.worker is not None
 
 
 @pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGINT])
