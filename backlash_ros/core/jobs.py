@@ -125,7 +125,8 @@ class WorkerExecutor(Executor):
             while not (asked or channel.closed or self._closed.is_set()):
                 try:
                     self.worker = self.worker or _start(*self._arguments)
-                    assert self.worker.stdin and self.worker.stdout
+                    assert self.worker.stdin
+                    assert self.worker.stdout
                     _send(self.worker.stdin, job)
                     asked = True
                     body = pickle.load(self.worker.stdout)

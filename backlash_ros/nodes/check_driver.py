@@ -26,7 +26,7 @@ from std_msgs.msg import Float64
 from backlash_ros import topics
 from backlash_ros.core import driver_check
 from backlash_ros.core.assembly import build_controller, build_limits
-from backlash_ros.core.control.limits import Limits, plausible
+from backlash_ros.core.control.limits import plausible
 from backlash_ros.core.control.motion import Drive, drive_limits
 from backlash_ros.core.parameters.table import CONTROLLER, RECORDER
 from backlash_ros.nodes.control.rivals import CommandLock
@@ -45,51 +45,135 @@ from backlash_ros.options import (
 LOOK_S = 0.1  # between two looks at the graph
 
 
-class MessageLog:
-    """All messages heard and sent; each is a line of a file as well where a path is given."""
+class CheckDriverNode(ProcessNode):
+    """Hears a driver and says what does not fit; the parameters are those of the controller.
 
-    def __init__(self, path: str | None) -> None:
-        self.heard = driver_check.Heard()
+    ended: why it stopped listening before its time.
+    """
+
+    ended = ''
+
+    def __init__(self, program: str, options: argparse.Namespace) -> None:
+        super().__init__(program, parameters_of=CONTROLLER)
+        build_controller(self.settings)
+        self.options, self.heard = options, driver_check.Heard()
+        self._graph = driver_check.Graph()  # with the most of them that were there at once
         # A line at a time, for `identify` reads it meanwhile.
-        self._file = open(path or os.devnull, 'w', 1, encoding='ascii')  # noqa: SIM115
+        self._file = open(options.messages or os.devnull, 'w', 1, encoding='ascii')  # noqa: SIM115
+
+    def work(self, executor: PromptExecutor) -> None:
+        reminder = self.every(3.0, lambda: say_what_is_missing(self))
+        deadline, found = time.monotonic() + self.options.wait, False
+        while not (found or self.stopping or time.monotonic() > deadline):
+            executor.spin_once(timeout_sec=LOOK_S)
+            found = bool(publishers(self, topics.PLANT_OUTPUT))
+        self.destroy_timer(reminder)
+        if found and not self.stopping:
+            self.follow(executor)
+        self.exit_code = self.tell()
+
+    def follow(self, executor: PromptExecutor) -> None:
+        """Listen for the duration."""
+        for topic in (topics.APPLIED_CONTROL, topics.CONTROL, topics.PLANT_OUTPUT):
+            self.hear(topic)
+        end = time.monotonic() + self.options.duration
+        self.listen_until(lambda: time.monotonic() > end, executor)
+
+    def hear(self, topic: str, answer: Callable[[float], None] = lambda value: None) -> None:
+        """Subscribe the way that hears whoever publishes, whatever the QoS."""
+        def on_message(message: Float64, info: dict[str, Any]) -> None:
+            answer(message.data)
+            self.note(topic, driver_check.Message(
+                message.data, info['source_timestamp'], info['received_timestamp'],
+                info['publication_sequence_number']))
+
+        self.listen(Float64, topic, on_message, QoSProfile(depth=DEPTH, reliability=(
+            ReliabilityPolicy.BEST_EFFORT if _has_best_effort(publishers(self, topic))
+            else ReliabilityPolicy.RELIABLE)))
 
     def note(self, topic: str, message: driver_check.Message) -> None:
         self.heard.by_topic[topic].append(message)
         print(topic, message.stamp_ns, repr(message.value), sep=',', file=self._file)
 
+    def listen_until(self, over: Callable[[], bool], executor: PromptExecutor) -> None:
+        self.every(LOOK_S, self.look)
+        while not (self.stopping or over()):
+            executor.spin_once(timeout_sec=LOOK_S)
+        self.look()
+        self.heard.end_ns = time.time_ns()
 
-class ActuatorDrive:
-    """Moves v: a control for every plant_output, from the v that acts, and to rest at the end.
+    def look(self) -> None:
+        """Take note of who is there."""
+        self._graph = max(graph_around(self), self._graph,
+                          key=lambda graph: (graph.publishers, graph.listeners))
 
-    It waits until everybody has found everybody and somebody listens. rivals: who else moves v.
-    ended: why the motion ended before its time.
+    def tell(self) -> int:
+        """Say what came of it; returns the exit code."""
+        findings = driver_check.judge(self._graph, self.heard, self.settings)
+        if self.ended:
+            findings.append(driver_check.Judgement(
+                'drive', driver_check.WRONG, f'{self.ended}: drive ended',
+                'let y come all the time; widen --output-range, or drive less: --amplitude, --rate',
+            ))
+        print(driver_check.table(findings), flush=True)
+        if self.options.save is not None:
+            self._save(self.options.save)
+        return DONE if driver_check.all_fit(findings) else FAILED
+
+    def say(self, text: str) -> None:
+        print(f'{self.get_name()}: {text}', file=sys.stderr)
+
+    def _save(self, path: Path) -> None:
+        period = self.settings.sample_period
+        record = driver_check.timing_of(self.heard, period).record
+        if record is None:
+            self.say(f'nothing to save in {path}: v and y were not both heard')
+            return
+        rows = np.column_stack([period * np.arange(len(record[0])), *record])
+        try:
+            np.savetxt(path, rows, '%.12g', ',', header='t,v,y', comments='')
+            print(f'saved {len(rows)} samples of v and y in {path}')
+        except OSError as error:
+            self.say(f'{path}: cannot be written: {error.strerror}')
+
+
+class DriveNode(CheckDriverNode):
+    """Moves v besides: a control for every plant_output, from the v that acts, to rest at the end.
+
+    It waits until everybody has found everybody and somebody listens. Whatever ends the motion, v
+    is brought to rest. rivals: who else moves v.
     """
 
-    def __init__(
-        self, node: ProcessNode, options: argparse.Namespace, limits: Limits, messages: MessageLog,
-    ) -> None:
-        self._node, self._options, self._limits, self._messages = node, options, limits, messages
+    def __init__(self, program: str, options: argparse.Namespace) -> None:
+        super().__init__(program, options)
+        self._limits = drive_limits(self.settings, options.amplitude, options.rate)
         self._motion: Drive | None = None  # v on its way
-        self._control = node.create_publisher(Float64, topics.CONTROL, DEPTH)
-        self._lock = CommandLock(
-            node.context.get_domain_id(), node.resolve_topic_name(topics.CONTROL))
-        self._settled_at = time.monotonic() + 1.0  # everybody found everybody
         self._newest_at = inf  # the newest y came
         self._answers = False
-        self.ended = self.rivals = ''
+        self.rivals = ''
 
-    @property
-    def over(self) -> bool:
-        """Whether v has had all the samples of the duration, late ones as well, or gets no more."""
-        duration_s = self._options.duration
-        enough = duration_s / self._node.settings.sample_period
-        return bool(self.ended or self.rivals) or len(self._messages.heard.controls) >= enough \
-            or time.monotonic() > self._settled_at + 2.0 * duration_s
+    def follow(self, executor: PromptExecutor) -> None:
+        """Listen until v has had all the samples of the duration, late ones as well, or no more."""
+        self.hear(topics.APPLIED_CONTROL)
+        self._control = self.create_publisher(Float64, topics.CONTROL, DEPTH)
+        self._lock = CommandLock(
+            self.context.get_domain_id(), self.resolve_topic_name(topics.CONTROL))
+        self._settled_at = time.monotonic() + 1.0  # everybody found everybody
+        self.hear(topics.PLANT_OUTPUT, self._answer)
+        duration_s = self.options.duration
+        enough = duration_s / self.settings.sample_period
+        try:
+            self.listen_until(
+                lambda: bool(self.ended or self.rivals) or len(self.heard.controls) >= enough
+                or time.monotonic() > self._settled_at + 2.0 * duration_s, executor)
+        finally:
+            self._come_to_rest()
 
     def look(self) -> None:
         """Take note of who else is there. Once heard, a rival counts, even if it leaves."""
-        rivals = {name_of(info) for info in publishers(self._node, topics.CONTROL)}
-        now, p = time.monotonic(), self._node.settings
+        super().look()
+        rivals = {name_of(info) for info in publishers(self, topics.CONTROL)}
+        now, p = time.monotonic(), self.settings
         if now > self._settled_at:
             if not self._lock.take():
                 rivals = rivals or {'a controller of this machine'}
@@ -97,187 +181,82 @@ class ActuatorDrive:
         self.rivals = self.rivals or ', '.join(sorted(rivals))
         patience_s = max(p.timeout.plant_output, 10.0 * p.sample_period)
         if self._answers and now > self._newest_at + patience_s:
-            output = self._node.resolve_topic_name(topics.PLANT_OUTPUT)
+            output = self.resolve_topic_name(topics.PLANT_OUTPUT)
             self.ended = f'nothing was heard on {output} for {patience_s:g} s'
 
-    def answer(self, y: float) -> None:
+    def tell(self) -> int:
+        control = self.resolve_topic_name(topics.CONTROL)
+        if self.rivals:
+            self.say(f'{control} is published by {self.rivals}: stop that first, '
+                     'or leave --drive out')
+            return BAD_INPUT
+        if not self.options.messages:
+            return super().tell()
+        if self.ended:
+            self.say(f'{self.ended}: drive ended')
+        if self.heard.controls:
+            return DONE
+        why = f'nobody subscribes to {control}' if self.heard.outputs else \
+            f'nothing was heard on {self.resolve_topic_name(topics.PLANT_OUTPUT)}'
+        self.say(f'the actuator was not moved: {why}')
+        return FAILED
+
+    def _answer(self, y: float) -> None:
         """Move v on by a sample, unless it has to wait or the motion has ended."""
         self._newest_at = time.monotonic()
         if self.rivals or not self._answers:
             return
-        low, high = self._options.output_range or (-inf, inf)
+        low, high = self.options.output_range or (-inf, inf)
         if plausible(y) and not low <= y <= high:
             self.ended = self.ended or f'y = {y:.4g} left --output-range'
         if self.ended:
             return
         if self._motion is None:
-            self._motion = Drive(self._limits, self._node.settings.sample_period,
-                                 self._options.duration, self._v_at_start())
+            self._motion = Drive(self._limits, self.settings.sample_period, self.options.duration,
+                                 self._v_at_start())
         v, now = self._motion.step(), time.time_ns()
         self._control.publish(Float64(data=v))
-        self._messages.note(topics.CONTROL, driver_check.Message(v, now, now, 0))
+        self.note(topics.CONTROL, driver_check.Message(v, now, now, 0))
 
     def _v_at_start(self) -> float:
         """The v that acts before the motion, 0 where nobody says it."""
-        p = self._node.settings
+        p = self.settings
         known = p.control.initial if plausible(p.control.initial) else None
-        for message in self._messages.heard.applied[-1:]:
+        for message in self.heard.applied[-1:]:
             if plausible(message.value):
                 return build_limits(p).go_on_from(message.value, known)
         if known is None:
-            say(self._node, 'nobody says which v acts now, so the drive goes on from 0: publish '
-                f'{topics.APPLIED_CONTROL}, or set control.initial')
+            self.say('nobody says which v acts now, so the drive goes on from 0: publish '
+                     f'{topics.APPLIED_CONTROL}, or set control.initial')
         return known or 0.0
 
-    def come_to_rest(self) -> None:
+    def _come_to_rest(self) -> None:
         """Bring v to rest, or hold it where that takes too long or another signal comes."""
         if self._motion is None:
             return
-        node, rest_s = self._node, self._options.rest
-        before, deadline = len(node.signals), time.monotonic() + rest_s
-        v = self._messages.heard.controls[-1].value
+        before, deadline = len(self.signals), time.monotonic() + self.options.rest
+        v = self.heard.controls[-1].value
         for v in self._motion.to_rest():
             self._control.publish(Float64(data=v))
-            time.sleep(node.settings.sample_period)
+            time.sleep(self.settings.sample_period)
             late = time.monotonic() > deadline
-            if late or len(node.signals) > before:
-                why = f'not at rest within --rest={rest_s:g} s' if late \
+            if late or len(self.signals) > before:
+                why = f'not at rest within --rest={self.options.rest:g} s' if late \
                     else 'another signal came'
-                say(node, f'v is held at {v:.6g}: {why}')
+                self.say(f'v is held at {v:.6g}: {why}')
                 break
         # A busy machine may lose a message, and this one is to be heard before the node leaves.
         for _ in range(10):
             self._control.publish(Float64(data=v))
             if self._control.wait_for_all_acked(Duration(seconds=0.1)):
                 return
-        say(node, f'the driver has not confirmed the last v={v:.6g}')
-
-
-class CheckDriverNode(ProcessNode):
-    """Hears a driver and, with --drive, answers every plant_output with a control.
-
-    v is brought to rest at the end, whatever ends the motion. The parameters are those of the
-    controller.
-    """
-
-    def __init__(self, program: str, options: argparse.Namespace) -> None:
-        super().__init__(program, parameters_of=CONTROLLER)
-        p = self.settings
-        build_controller(p)
-        self._options = options
-        self._limits = drive_limits(p, options.amplitude, options.rate) if options.drive else None
-        self._drive: ActuatorDrive | None = None  # once the driver is found
-        self._messages = MessageLog(options.messages)
-        self._graph = driver_check.Graph()  # with the most of them that were there at once
-
-    def work(self, executor: PromptExecutor) -> None:
-        if self._finds_driver(executor):
-            try:
-                self._follow(executor)
-            finally:
-                if self._drive is not None:
-                    self._drive.come_to_rest()
-        self.exit_code = self._tell()
-
-    def _finds_driver(self, executor: PromptExecutor) -> bool:
-        reminder = self.every(3.0, lambda: say_what_is_missing(self))
-        deadline, found = time.monotonic() + self._options.wait, False
-        while not (found or self.stopping or time.monotonic() > deadline):
-            executor.spin_once(timeout_sec=LOOK_S)
-            found = bool(publishers(self, topics.PLANT_OUTPUT))
-        self.destroy_timer(reminder)
-        return found and not self.stopping
-
-    def _follow(self, executor: PromptExecutor) -> None:
-        """Listen for the duration, or until the drive is over."""
-        self._hear(topics.APPLIED_CONTROL)
-        if self._limits is not None:
-            self._drive = ActuatorDrive(self, self._options, self._limits, self._messages)
-        else:
-            self._hear(topics.CONTROL)
-        self._hear(topics.PLANT_OUTPUT)
-        end = time.monotonic() + self._options.duration
-        self.every(LOOK_S, self._look)
-        while not (self.stopping or (self._drive.over if self._drive else time.monotonic() > end)):
-            executor.spin_once(timeout_sec=LOOK_S)
-        self._look()
-        self._messages.heard.end_ns = time.time_ns()
-
-    def _look(self) -> None:
-        """Take note of who is there."""
-        self._graph = max(graph_around(self), self._graph,
-                          key=lambda graph: (graph.publishers, graph.listeners))
-        if self._drive is not None:
-            self._drive.look()
-
-    def _hear(self, topic: str) -> None:
-        """Subscribe the way that hears whoever publishes, whatever the QoS."""
-        def on_message(message: Float64, info: dict[str, Any]) -> None:
-            if topic == topics.PLANT_OUTPUT and self._drive is not None:
-                self._drive.answer(message.data)
-            self._messages.note(topic, driver_check.Message(
-                message.data, info['source_timestamp'], info['received_timestamp'],
-                info['publication_sequence_number']))
-
-        self.listen(Float64, topic, on_message, profile(self, topic))
-
-    def _tell(self) -> int:
-        """Say what came of it; returns the exit code."""
-        drive, options = self._drive, self._options
-        control = self.resolve_topic_name(topics.CONTROL)
-        if drive is not None and drive.rivals:
-            say(self, f'{control} is published by {drive.rivals}: stop that first, '
-                'or leave --drive out')
-            return BAD_INPUT
-        ended = '' if drive is None else drive.ended
-        if options.messages:
-            if ended:
-                say(self, f'{ended}: drive ended')
-            if drive is not None and self._messages.heard.controls:
-                return DONE
-            why = f'nobody subscribes to {control}' if self._messages.heard.outputs else \
-                f'nothing was heard on {self.resolve_topic_name(topics.PLANT_OUTPUT)}'
-            say(self, f'the actuator was not moved: {why}')
-            return FAILED
-        findings = driver_check.judge(self._graph, self._messages.heard, self.settings)
-        if ended:
-            findings.append(driver_check.Judgement(
-                'drive', driver_check.WRONG, f'{ended}: drive ended',
-                'let y come all the time; widen --output-range, or drive less: --amplitude, --rate',
-            ))
-        print(driver_check.table(findings), flush=True)
-        if options.save is not None:
-            self._save(options.save)
-        return DONE if driver_check.all_fit(findings) else FAILED
-
-    def _save(self, path: Path) -> None:
-        period = self.settings.sample_period
-        record = driver_check.timing_of(self._messages.heard, period).record
-        if record is None:
-            say(self, f'nothing to save in {path}: v and y were not both heard')
-            return
-        rows = np.column_stack([period * np.arange(len(record[0])), *record])
-        try:
-            np.savetxt(path, rows, '%.12g', ',', header='t,v,y', comments='')
-            print(f'saved {len(rows)} samples of v and y in {path}')
-        except OSError as error:
-            say(self, f'{path}: cannot be written: {error.strerror}')
-
-
-def say(node: Node, text: str) -> None:
-    print(f'{node.get_name()}: {text}', file=sys.stderr)
+        self.say(f'the driver has not confirmed the last v={v:.6g}')
 
 
 def publishers(node: Node, topic: str) -> list[TopicEndpointInfo]:
     """Who else publishes a topic."""
     return [info for info in node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
             if info.node_name != node.get_name()]
-
-
-def profile(node: Node, topic: str) -> QoSProfile:
-    """The QoS that hears whoever publishes a topic."""
-    return QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT if
-                      _has_best_effort(publishers(node, topic)) else ReliabilityPolicy.RELIABLE)
 
 
 def graph_around(node: Node) -> driver_check.Graph:
@@ -359,6 +338,7 @@ def main(args: list[str] | None = None) -> int:
     plain, given = split_arguments(args)
     options = parse_options(plain)
     program = 'identify' if options.messages else 'check_driver'
+    node = DriveNode if options.drive else CheckDriverNode
     with tempfile.TemporaryDirectory() as folder:
         if options.config is not None:
             config = find_config(Path(options.config))
@@ -369,7 +349,7 @@ def main(args: list[str] | None = None) -> int:
                                          rb'\1' + program.encode(), config.read_bytes()))
             for file in (meant, config):
                 given = ['--ros-args', '--params-file', str(file), *given]
-        return run(program, lambda: CheckDriverNode(program, options), given)
+        return run(program, lambda: node(program, options), given)
 
 
 if __name__ == '__main__':
