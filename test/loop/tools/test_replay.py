@@ -75,8 +75,9 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.usefixtures('undrawn')
 def test_the_command_says_that_nothing_parts_or_where(recorded, tmp_path, capsys):
-    assert main([str(recorded), '--set', 'plant.uncertainty=0.1', '--out', str(tmp_path)]) == 0
-    assert 'part from those of the run at t = 0.' in capsys.readouterr().out
+    for option in ('--set', '--sweep'):
+        assert main([str(recorded), option, 'plant.uncertainty=0.1', '--out', str(tmp_path)]) == 0
+        assert 'part from those of the run at t = 0.' in capsys.readouterr().out
     assert main([str(recorded), '--out', str(tmp_path)]) == 0
     assert 'to the last bit' in capsys.readouterr().out
     names = {path.name for path in tmp_path.iterdir()}
