@@ -21,6 +21,8 @@ which is printed, so that you can listen in.
 """
 
 import argparse
+import os
+import signal
 import sys
 from collections.abc import Sequence
 from functools import partial
@@ -47,11 +49,18 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_args(arguments)
 
 
+def _end(*_: object) -> None:
+    os.write(2, b'bringup: interrupted\n')
+    os._exit(FAILED)
+
+
 def _bringup(arguments: Sequence[str] | None) -> int:
     options = parse_options(arguments)
-    # numpy and scipy take a second to load, in which a Ctrl-C is to be heard already.
+    # numpy and scipy take a second to load, and may swallow the exception of a Ctrl-C.
+    before = signal.signal(signal.SIGINT, _end)
     from backlash_ros.tools.bringup.plan import prepare
     from backlash_ros.tools.bringup.watch import report, run
+    signal.signal(signal.SIGINT, before)
     axes = prepare(options)
     live_port = options.live_port or (0 if options.live else None)
     failure = run(axes, options.record, live_port)
