@@ -12,7 +12,7 @@ import numpy as np
 
 from backlash_ros.core.parameters import ParameterError
 from backlash_ros.core.plant.backlash import clamp
-from backlash_ros.core.plant.transfer_function import Array, TransferFunction
+from backlash_ros.core.plant.transfer_function import TransferFunction
 
 
 @dataclass(frozen=True)
@@ -68,16 +68,14 @@ class Motor:
         right, left = actuator.wind_up
         self._offset = 0.5 * (right - left)
         self._wind_up = 0.5 * (right + left) * actuator.gain  # [v]
-        self._a, self._b, _ = actuator.lag.state_space()
-        self._x: Array = np.zeros(0)
+        self._lag, self._x = actuator.lag, list[float]()
 
     def step(self, command: float, load: float, c_r: float, c_l: float) -> float:
         """Go on by one sample; return v at the end of it. load: u / m, what the gap holds [v]."""
         reached = command - self._offset
-        if not len(self._x):
-            at_rest = np.linalg.solve(np.eye(len(self._b)) - self._a, self._b)
-            self._x = np.asarray(at_rest * reached)
-        self._x = self._a @ self._x + self._b * reached
-        q, w = float(self._x[0]), self._wind_up
+        if not self._x:
+            a, b, _ = self._lag.state_space()
+            self._x = (np.linalg.solve(np.eye(len(b)) - a, b) * reached).tolist()
+        q, w = self._lag.advance(self._x, reached), self._wind_up
         load = clamp(load, q - w - c_r, q + w - c_l)
         return clamp(q, load + c_l, load + c_r)

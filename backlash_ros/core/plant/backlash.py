@@ -5,7 +5,6 @@ v while the right side is engaged, and on v + gap while the left one is.
 """
 
 from enum import IntEnum
-from math import isfinite
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,9 +39,6 @@ class Backlash:
     """
 
     def __init__(self, m: float, c_r: float, c_l: float, u: float = 0.0) -> None:
-        for name, value in (('m', m), ('c_r', c_r), ('c_l', c_l), ('initial_u', u)):
-            if not isfinite(value):
-                raise ParameterError(f'backlash.{name}', value, 'must be finite')
         if m <= 0.0:
             raise ParameterError('backlash.m', m, 'must be > 0')
         if c_l >= c_r:
