@@ -75,21 +75,17 @@ class ReferenceNode(ProcessNode):
 
         outputs = self._io.listen(hear, depth=1, polled=True)
         diagnostics = self.listen_to_diagnostics(self._hear_diagnostics)
-        serve_at = now
         while not self.stopping:
-            if now >= serve_at:
-                executor.spin_once(timeout_sec=0.0)
-                serve_at = now + 0.05  # between two looks at signals and requests
-                if pace.waits:
-                    serve_polled(diagnostics)
-                    # Fast DDS may miss a process of another machine for good that starts at the
-                    # same moment.
-                    if now > self._loop_runs_at + 0.5:
-                        pace.waits = False
-                        self.log.warning(
-                            f'{self._io.topics.output} is not heard here, but by the controller: '
-                            'y_m goes by the own clock; start the driver some seconds before'
-                        )
+            if pace.waits:
+                serve_polled(diagnostics)
+                # Fast DDS may miss a process of another machine for good that starts at the same
+                # moment.
+                if now > self._loop_runs_at + 0.5:
+                    pace.waits = False
+                    self.log.warning(
+                        f'{self._io.topics.output} is not heard here, but by the controller: y_m '
+                        'goes by the own clock; start the driver some seconds before'
+                    )
             if now >= pace.due_s:
                 serve_polled(outputs)
                 now = time.monotonic()
@@ -98,7 +94,7 @@ class ReferenceNode(ProcessNode):
                     self._publish(sample)
             # An output that is late is looked for often: y_m leaves as soon as it is there.
             wake_at = pace.due_s if now < pace.due_s else now + 0.05 * p.sample_period
-            time.sleep(max(min(wake_at, serve_at) - now, 0.0))
+            executor.spin_once(timeout_sec=max(wake_at - now, 0.0))
             now = time.monotonic()
 
     def _hear_diagnostics(
