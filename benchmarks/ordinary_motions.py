@@ -6,6 +6,7 @@ moves from point to point with rests, while the true plant differs from the nomi
 All cases, one seed each:     python benchmarks/ordinary_motions.py
 Some of them, three seeds:    ... --cases 'sine|moves' exact --seeds 3 --by motion
 Drawn from all that is usual: ... --random 40 --first-seed 7 --samples 20000
+The table of the document:    ... --by motion --write
 """
 
 import os
@@ -22,7 +23,7 @@ import numpy as np
 from cases.loops import NINE_DIGITS, load_model, loop_on, motor, random_backlash
 from contract.figures import FAR, Array, Figure, by_group, figure, judged, rms, share, upper
 from numpy.typing import NDArray
-from reporting import format_table, parallel, parser_of
+from reporting import ROOT, format_table, markdown_table, parallel, parser_of, write_between
 
 from backlash_ros.core import Status
 
@@ -345,6 +346,7 @@ def main() -> int:
     parser.add_argument('--workers', type=int, default=1, help='processes, default 1')
     parser.add_argument('--by', choices=('case', 'motion', 'plant'), default='case',
                         help='what a row of the table is')
+    parser.add_argument('--write', action='store_true', help='write it into docs/estimation.md')
     arguments = parser.parse_args()
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
     drawn = random_cases(arguments.random, arguments.first_seed, arguments.samples) \
@@ -360,7 +362,10 @@ def main() -> int:
     groups: dict[str, list[Result]] = {}
     for case, result in zip(cases, results, strict=True):
         groups.setdefault(label(case), []).append(result)
-    print(format_table(HEADER, [row(*group) for group in [*groups.items(), ('all', results)]]))
+    table = HEADER, [row(*group) for group in [*groups.items(), ('all', results)]]
+    print(format_table(*table))
+    if arguments.write:
+        write_between(ROOT / 'docs' / 'estimation.md', 'ordinary_motions', markdown_table(*table))
     for result in results:
         if result.faults:
             print(f'    {result.motion}; {result.plant}; {result.rate:g} Hz, seed {result.seed}: '
