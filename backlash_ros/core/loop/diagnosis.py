@@ -207,14 +207,8 @@ def findings_of(f: LoopFigures) -> list[Finding]:
             lesser += ['unreported']
         if law.wrong_sign:
             lesser += ['rate', 'stamps', 'clock', 'reference silent', 'limited']
-        first = [cause for cause in causes if cause.kind not in lesser]
-        return [*first, state, *(cause for cause in causes if cause.kind in lesser)]
+        return sorted([*causes, state], key=lambda each: (each.kind in lesser, each is state))
     return [*causes, state] if state.level != Level.OK or not causes else causes
-
-
-def state_beside(causes: set[str], f: LoopFigures) -> Finding:
-    """How the learning goes where causes of these kinds were found."""
-    return _findings(_states_beside(causes, f))[0]
 
 
 def _findings(rows: Iterable[Row]) -> list[Finding]:
@@ -329,8 +323,8 @@ def causes_of(f: LoopFigures) -> tuple[Row, ...]:
     )
 
 
-def _states_beside(causes: set[str], f: LoopFigures) -> tuple[Row, ...]:
-    """The table of states where causes of these kinds were found: the first that holds counts."""
+def state_beside(causes: set[str], f: LoopFigures) -> Finding:
+    """How the learning goes where causes of these kinds were found: the first row that holds."""
     ok, warn, error = Level
     y, (status, law, inconsistent_s, adapting, given) = f.around.output, f.learning
     share = 100.0 * law.unexplained
@@ -340,7 +334,7 @@ def _states_beside(causes: set[str], f: LoopFigures) -> tuple[Row, ...]:
     # Where a tenth is late or lost nobody can tell what else is wrong; nor for some seconds else.
     many = f.late + f.lost > 0.1 * (f.heard + f.lost)
     late = not causes.isdisjoint(LATE_KINDS) and (many or inconsistent_s < 3.0)
-    return (
+    return _findings((
         ('held', warn, held and ('rate' in causes or late), f'{y} does not follow from v '
          + ('at this rate' if 'rate' in causes else 'while samples are late or lost')
          + ': estimates held'),
@@ -370,4 +364,4 @@ def _states_beside(causes: set[str], f: LoopFigures) -> tuple[Row, ...]:
          'no G and no backlash: check G(z), load, sensor'),
         ('model', error, True,
          f'{y} does not follow from v through G(z): check G(z), the sensor, the actuator'),
-    )
+    ))[0]
