@@ -19,7 +19,7 @@ from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.options import OptionParser
 from backlash_ros.tools import cli
-from backlash_ros.tools.config import effective_parameters
+from backlash_ros.tools.config import read_configuration
 from backlash_ros.tools.runs.files import result_directory
 from backlash_ros.tools.runs.read_run import run_loop
 from backlash_ros.topics import BACKLASH
@@ -110,7 +110,8 @@ def make_parser() -> argparse.ArgumentParser:
 
 def _compare(args: Sequence[str] | None) -> None:
     options = make_parser().parse_args(args)
-    scenario = effective_parameters(options.config, options.settings, options.seed, options.axis)
+    configuration = read_configuration(options.config, options.settings, options.seed)
+    scenario = configuration.parameters(options.axis)
     samples = cli.number_of_samples(scenario, options.duration)
     if options.out is not None:
         result_directory(options.out)  # fails before long runs, not after them

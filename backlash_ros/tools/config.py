@@ -117,13 +117,6 @@ def read_configuration(
     return Configuration(path, checked, parsed, seed, axes, () if axes else joints)
 
 
-def effective_parameters(
-    config: Path | None, settings: Sequence[str] = (), seed: int | None = None, axis: str = '',
-) -> Parameters:
-    """Return the complete set for one axis, as `Configuration.parameters` does."""
-    return read_configuration(config, settings, seed).parameters(axis)
-
-
 def parse_setting(text: str) -> tuple[str, str, Value]:
     """Return the checked content of `KEY=VALUE` or `AXIS/KEY=VALUE`, the value as in YAML."""
     key, equals, given = text.partition('=')

@@ -13,7 +13,7 @@ from backlash_ros.core.parameters import Parameters, as_yaml
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.options import OptionParser
 from backlash_ros.tools import batch, cli
-from backlash_ros.tools.config import effective_parameters, write_config
+from backlash_ros.tools.config import read_configuration, write_config
 from backlash_ros.tools.runs.files import CONFIG_FILE, Run, result_directory, write_table
 from backlash_ros.tools.runs.read_run import run_loop
 from backlash_ros.tools.runs.summary import estimate_table
@@ -34,7 +34,8 @@ def make_parser() -> argparse.ArgumentParser:
 
 def _simulate(args: Sequence[str] | None) -> None:
     options = make_parser().parse_args(args)
-    parameters = effective_parameters(options.config, options.settings, options.seed, options.axis)
+    configuration = read_configuration(options.config, options.settings, options.seed)
+    parameters = configuration.parameters(options.axis)
     if options.seeds is not None and options.seeds < 1:
         raise cli.InputError(f'--seeds={options.seeds} must be >= 1')
     many = options.seeds is not None or options.sweep or options.cluster is not None

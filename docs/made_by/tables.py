@@ -17,7 +17,7 @@ from backlash_ros.core.assembly import build_model, build_true_model
 from backlash_ros.core.parameters import BY_NAME, Parameter, as_yaml
 from backlash_ros.core.plant.transfer_function import TransferFunction
 from backlash_ros.core.simulation.run_record import RunRecord, control_error_rms, settling_time
-from backlash_ros.tools.config import effective_parameters
+from backlash_ros.tools.config import read_configuration
 from backlash_ros.tools.runs.read_run import run_loop
 
 # No compensation: the inverse is told that there is no gap, and learns nothing.
@@ -43,8 +43,8 @@ def simulate(
 
 @cache
 def _simulate(duration: float, settings: tuple[tuple[str, str], ...], config: str | None) -> Run:
-    parameters = effective_parameters(
-        Path(config) if config else None, [f'{name}={value}' for name, value in settings])
+    parameters = read_configuration(Path(config) if config else None, [
+        f'{name}={value}' for name, value in settings]).parameters()
     loop = build_closed_loop(parameters)
     record = run_loop(loop, round(duration / parameters.sample_period))
     learned = loop.controller.redesign.adopted

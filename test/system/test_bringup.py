@@ -20,7 +20,7 @@ from ros_processes import ros_world
 from backlash_ros import topics
 from backlash_ros.core.simulation.closed_loop import build_closed_loop, parting, replay
 from backlash_ros.core.simulation.run_record import RunRecord
-from backlash_ros.tools.config import effective_parameters
+from backlash_ros.tools.config import read_configuration
 from backlash_ros.tools.records.reading import read_record
 from backlash_ros.tools.runs.read_run import read_run
 
@@ -87,7 +87,7 @@ def test_a_run_in_lockstep_equals_the_simulation_to_the_last_bit_and_leaves_no_p
         *(part for each in settings for part in ('--set', each)))
     assert session.wait() == 0, session.stderr
     assert session.survivors() == {}
-    simulated = build_closed_loop(effective_parameters(None, settings, 5)).run(samples)
+    simulated = build_closed_loop(read_configuration(None, settings, 5).parameters()).run(samples)
     bag = session.out / 'bag'
     source = read_run(bag)
     assert_same(source.record, simulated)

@@ -11,7 +11,7 @@ from backlash_ros.core.records.record import Record, RecordError
 from backlash_ros.core.records.time_grid import record_of
 from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.tools.cli import WHOLE_SPAN, InputError, Span
-from backlash_ros.tools.config import effective_parameters
+from backlash_ros.tools.config import read_configuration
 from backlash_ros.tools.records.columns import COMMAND, choose_columns
 from backlash_ros.tools.records.table import read_table
 from backlash_ros.tools.runs.files import SAMPLE_COLUMNS, Run, rows_of
@@ -87,7 +87,7 @@ def read_run_or_log(
             if find_bag(path) is None:
                 raise
             no_run = error
-    parameters = None if config is None else effective_parameters(config, axis=axis)
+    parameters = None if config is None else read_configuration(config).parameters(axis)
     period, record = None if parameters is None else parameters.sample_period, None
     with suppress(InputError):  # as `identify` takes it, if that fits
         record = read_record(path, None, span, axis, columns)

@@ -17,7 +17,7 @@ from backlash_ros.tools.bringup.plan import Axis
 from backlash_ros.tools.bringup.supervisor import Child, ProcessSupervisor, child_environment
 from backlash_ros.tools.bringup.watch import execute
 from backlash_ros.tools.cli import StopRequests
-from backlash_ros.tools.config import effective_parameters
+from backlash_ros.tools.config import read_configuration
 
 READY = (
     'import signal; signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT]);'
@@ -52,7 +52,7 @@ def watch(
     mark = uuid.uuid4().hex
     monkeypatch.setenv(MARK, mark)
     def watch_programs(hurry: bool = False, **programs: str) -> Watched:
-        parameters = effective_parameters(None).replaced({'samples': 100})
+        parameters = read_configuration(None).parameters().replaced({'samples': 100})
         axis = Axis('', parameters, tmp_path)
         axis.logs.mkdir()
         stages = [

@@ -11,7 +11,7 @@ from backlash_ros.core import Estimate, Parameters, build_controller
 from backlash_ros.core.estimate import save_estimate
 from backlash_ros.tools import simulate as simulate
 from backlash_ros.tools.cli import InputError
-from backlash_ros.tools.config import effective_parameters
+from backlash_ros.tools.config import read_configuration
 from backlash_ros.tools.identify.command import main
 from backlash_ros.tools.records.reading import read_record
 
@@ -62,7 +62,7 @@ def test_all_files_are_written_with_the_numbers_of_the_actuator(result: Path) ->
 
 
 def test_the_file_is_a_complete_configuration(result: Path) -> None:
-    parameters = effective_parameters(result / 'identified.yaml')
+    parameters = read_configuration(result / 'identified.yaml').parameters()
     numbers = json.loads((result / 'identified.json').read_text())
     assert parameters.plant.denominator == pytest.approx(numbers['denominator'])
     assert parameters.control.delay_samples == numbers['delay_samples']
@@ -77,7 +77,7 @@ def test_the_loop_with_the_file_follows_wherever_0_of_v_is(tmp_path: Path) -> No
     (v, y), offset = record(), 40.0
     source, out = write_csv(tmp_path / 'a.csv', v + offset, y), tmp_path / 'out'
     assert main([str(source), *QUICK, '--integrator', 'no', '--out', str(tmp_path)]) == 0
-    initial = effective_parameters(tmp_path / 'identified.yaml').estimator.initial
+    initial = read_configuration(tmp_path / 'identified.yaml').parameters().estimator.initial
     assert (initial.c_r, initial.c_l) == pytest.approx((0.5 + offset, -0.4 + offset), abs=0.01)
     assert simulate.main(['--config', str(tmp_path / 'identified.yaml'), '--duration', '5',
                           '--out', str(out)]) == 0
@@ -141,7 +141,7 @@ def test_an_axis_gets_a_file_of_its_own(tmp_path, capsys):
     assert main(given) == 2
     assert 'must be one of x, z: choose it with --axis' in capsys.readouterr().err
     assert main([*given, '--axis', 'z']) == 0
-    found = effective_parameters(tmp_path / 'out' / 'identified.yaml', axis='z')
+    found = read_configuration(tmp_path / 'out' / 'identified.yaml').parameters('z')
     assert found.control.max == 5.0
 
 

@@ -24,7 +24,7 @@ from backlash_ros.tools import replay as replay
 from backlash_ros.tools import report as report
 from backlash_ros.tools import simulate as simulate
 from backlash_ros.tools.bringup import __main__ as bringup
-from backlash_ros.tools.config import effective_parameters, flattened
+from backlash_ros.tools.config import flattened, read_configuration
 from backlash_ros.tools.identify import command as identify
 
 DOCS = ROOT / 'docs'
@@ -153,8 +153,8 @@ def check_tool(program: str, arguments: list[str]) -> None:
     if options.config is not None and Path(options.config).name in elsewhere:
         return
     if program in ('simulate', 'bringup'):
-        build_controller(effective_parameters(
-            options.config, options.settings, options.seed, options.axis))
+        build_controller(read_configuration(
+            options.config, options.settings, options.seed).parameters(options.axis))
     else:
         assert options.config is None or (ROOT / options.config).is_file()
     for sweep in getattr(options, 'sweep', []):

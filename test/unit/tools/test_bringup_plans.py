@@ -19,7 +19,7 @@ from backlash_ros.tools.bringup.plan import (
 )
 from backlash_ros.tools.bringup.supervisor import Child, child_environment, foreign_environment
 from backlash_ros.tools.cli import BrokenOffError
-from backlash_ros.tools.config import effective_parameters
+from backlash_ros.tools.config import read_configuration
 
 CONFIG = ROOT / 'config' / 'two_axes.yaml'
 DRIVER = 'drive --axis {axis}'
@@ -85,7 +85,7 @@ def test_what_the_user_has_set_reaches_the_nodes(tmp_path, monkeypatch):
 
 
 def plan(folder: Path, driver: str, *names: str, **values: object) -> list[Axis]:
-    parameters = effective_parameters(None).replaced({'driver': driver, **values})
+    parameters = read_configuration(None).parameters().replaced({'driver': driver, **values})
     return [Axis(name, parameters, folder / name) for name in names or ('',)]
 
 
@@ -151,7 +151,7 @@ def test_one_axis_alone_can_be_taken_from_the_file(tmp_path: Path) -> None:
 
 
 def begun(folder: Path, driver: str = '', **values: object) -> Axis:
-    p = effective_parameters(None).replaced({'samples': 100, 'driver': driver, **values})
+    p = read_configuration(None).parameters().replaced({'samples': 100, 'driver': driver, **values})
     return Axis('', p, folder)
 
 

@@ -11,7 +11,6 @@ from backlash_ros.core.estimate import load_estimate
 from backlash_ros.core.parameters import ParameterError
 from backlash_ros.tools.cli import InputError
 from backlash_ros.tools.config import (
-    effective_parameters,
     parse_setting,
     read_configuration,
     write_config,
@@ -37,7 +36,7 @@ def test_paper_example_says_what_the_table_says_but_that_its_plant_is_exact() ->
     # The paper supposes G(z) exact, which the plant of a user never is.
     exact = Parameters().replaced({'plant.uncertainty': 0.0})
     assert example == {name: exact[name] for name in example}
-    assert effective_parameters(None) == exact
+    assert read_configuration(None).parameters() == exact
     assert Parameters().plant.uncertainty > 0.0
 
 
@@ -45,7 +44,7 @@ def test_paper_example_says_what_the_table_says_but_that_its_plant_is_exact() ->
 def test_shipped_file_loads_and_runs(path: Path) -> None:
     configuration = read_configuration(path)
     for axis in configuration.axes or configuration.joints or ('',):
-        parameters = effective_parameters(path, axis=axis)
+        parameters = read_configuration(path).parameters(axis)
         assert build_closed_loop(parameters).run(50).samples == 50
 
 
@@ -53,13 +52,13 @@ def test_of_an_arm_one_joint_is_chosen(config: Path) -> None:
     written(config, """/**/controller: {ros__parameters: {joints: [waist, wrist],
       control: {rate_max: 2.0}, waist: {control: {rate_max: 1.0}, plant: {denominator: [1, -0.5],
       numerator: [0.5]}}, io: {style: joint_state_topic}}}""")
-    assert effective_parameters(config, axis='waist')['control.rate_max'] == 1.0
-    assert effective_parameters(config, axis='wrist')['control.rate_max'] == 2.0
+    assert read_configuration(config).parameters('waist')['control.rate_max'] == 1.0
+    assert read_configuration(config).parameters('wrist')['control.rate_max'] == 2.0
     with pytest.raises(InputError, match="axis='' must be one of waist, wrist"):
-        effective_parameters(config)
+        read_configuration(config).parameters()
     written(config, config.read_text().replace('numerator:', 'numerators:'))
     with pytest.raises(ParameterError, match=r'waist\.plant\.numerators is not a parameter'):
-        effective_parameters(config, axis='waist')
+        read_configuration(config).parameters('waist')
 
 
 def test_values_of_joints_are_written_back_and_may_stand_apart_from_their_list(config, tmp_path):
@@ -148,7 +147,7 @@ def test_bad_setting_is_refused(text: str, message: str) -> None:
 
 def test_settings_go_before_the_file_and_the_seed_before_both(config: Path) -> None:
     written(config, '/**: {ros__parameters: {seed: 2, amplitude: 2.0, bias: 2.0}}')
-    parameters = effective_parameters(config, ['amplitude=3', 'seed=3'], seed=4)
+    parameters = read_configuration(config, ['amplitude=3', 'seed=3'], seed=4).parameters()
     assert (parameters['bias'], parameters['amplitude'], parameters['seed']) == (2.0, 3.0, 4)
 
 
@@ -168,7 +167,7 @@ def test_named_node_goes_before_named_axis_and_that_before_all(config, sections)
         text = AXES + ''.join(
             f'{name}: {{ros__parameters: {{seed: {values[name]}}}}}\n' for name in left)
         written(config, text)
-        assert effective_parameters(config, axis='x')['seed'] == values[specific]
+        assert read_configuration(config).parameters('x')['seed'] == values[specific]
         left.remove(specific)
 
 
@@ -187,11 +186,11 @@ def test_section_that_no_axis_would_read_is_refused(config, section, message):
 def test_one_of_several_axes_must_be_chosen_by_its_name(config: Path) -> None:
     written(config, AXES)
     with pytest.raises(InputError, match="axis='' must be one of x, y: choose it with --axis"):
-        effective_parameters(config)
+        read_configuration(config).parameters()
     with pytest.raises(InputError, match="axis='z' must be one of x, y"):
-        effective_parameters(config, axis='z')
+        read_configuration(config).parameters('z')
     with pytest.raises(InputError, match="--set z/seed: axis='z' must be one of x, y"):
-        effective_parameters(config, ['z/seed=1'], axis='x')
+        read_configuration(config, ['z/seed=1']).parameters('x')
 
 
 OLD = ROOT / 'test' / 'of_0_2_0'
@@ -199,7 +198,7 @@ LAST = {'m': 1.30029, 'c_r': 3.00258, 'c_l': -2.99812}  # as 0.2.0 printed them
 
 
 def test_parameter_file_means_what_it_meant() -> None:
-    parameters = effective_parameters(OLD / 'parameters.yaml')
+    parameters = read_configuration(OLD / 'parameters.yaml').parameters()
     assert (parameters.lockstep, parameters.samples, parameters.output_noise_std) == (
         True, 50, 1e-4)
     assert parameters.estimator.law == 'moving_horizon'
@@ -207,8 +206,8 @@ def test_parameter_file_means_what_it_meant() -> None:
 
 
 def test_saved_estimates_are_begun_with() -> None:
-    parameters = effective_parameters(OLD / 'parameters.yaml', [
-        'estimates.load=true', f'estimates.file={OLD / "estimates.json"}'])
+    parameters = read_configuration(OLD / 'parameters.yaml', [
+        'estimates.load=true', f'estimates.file={OLD / "estimates.json"}']).parameters()
     found = load_estimate(parameters)
     assert {name: getattr(found, name) for name in LAST} == pytest.approx(LAST, rel=1e-5)
     assert found.learned
