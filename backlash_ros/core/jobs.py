@@ -4,6 +4,7 @@ A job is a pure function of what it is given. The loop submits one at a time to 
 for its result; neither waits for a job.
 """
 
+import ctypes
 import os
 import pickle
 import signal
@@ -179,34 +180,28 @@ def _send(stream: IO[bytes], body: bytes) -> None:
 
 
 def serve(preload: Sequence[str], loops: int) -> None:
-    """Compute jobs that come through the standard input, until it ends."""
+    """Compute jobs that come through the standard input, until it or the parent ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)
-    results, requests = os.fdopen(os.dup(1), 'wb'), SimpleQueue[bytes]()
+    # PR_SET_PDEATHSIG: it ends with the thread that started it, also while a job is computed.
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)
+    results = os.fdopen(os.dup(1), 'wb')
     os.dup2(2, 1)  # what a job prints is no result
-    Thread(target=_receive, args=(requests,), daemon=True).start()
     for name in preload:
         import_module(name)
     # Where nothing explains what a plant does, one search follows the other. On average they get
     # this share of a processor for each loop, so that no command is late for them.
     share, burst_s = 0.25 * loops, 5.0
     credit_s, since = burst_s, time.monotonic()
-    while True:
-        job = requests.get()
-        began = time.process_time()
-        _send(results, _result_of(job))
-        credit_s += share * (time.monotonic() - since)
-        since = time.monotonic()
-        credit_s = min(credit_s, burst_s) - (time.process_time() - began)
-        time.sleep(max(-credit_s / share, 0.0))
-
-
-def _receive(requests: SimpleQueue[bytes]) -> None:
-    """Read requests, also while a job is computed, and end the process with the last of them."""
-    with suppress(EOFError, OSError, pickle.UnpicklingError):
+    with suppress(EOFError, pickle.UnpicklingError):  # nobody sends another one
         while True:
-            requests.put(pickle.load(sys.stdin.buffer))
-    os._exit(0)
+            job = pickle.load(sys.stdin.buffer)
+            began = time.process_time()
+            _send(results, _result_of(job))
+            credit_s += share * (time.monotonic() - since)
+            since = time.monotonic()
+            credit_s = min(credit_s, burst_s) - (time.process_time() - began)
+            time.sleep(max(-credit_s / share, 0.0))
 
 
 def _result_of(job: bytes) -> bytes:
