@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from math import inf, isfinite, nan
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from backlash_ros.core.estimate import Status, was_given
 from backlash_ros.core.law import LawReport, OutOfBounds
@@ -166,7 +166,7 @@ class LoopFigures(Counts):
 
 
 def figures_of_loop(loop: 'ControlLoop', p: Parameters, timing: Timing,
-                    gained: Mapping[str, int], around: Neighbours) -> LoopFigures:
+                    gained: Mapping[str, Any], around: Neighbours) -> LoopFigures:
     """What is known of a loop. gained: counts lately."""
     statistics, estimate, law = loop.statistics, loop.estimate, loop.core.estimator
     # Hardware on topics falls silent where all joints are where they belong.
@@ -174,7 +174,7 @@ def figures_of_loop(loop: 'ControlLoop', p: Parameters, timing: Timing,
     unreferred_s = loop.driver.steady_s() - loop.heard.y_m_at
     unreferred = not may_be_silent and 0.0 < p.timeout.reference < unreferred_s
     return LoopFigures(
-        **cast(Mapping[str, Any], gained), around=around,
+        **gained, around=around,
         # In lockstep the outputs come as fast as the machine goes.
         timing=Timing(p.sample_period) if p.lockstep else timing,
         learning=Learning(

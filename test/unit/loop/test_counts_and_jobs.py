@@ -1,4 +1,4 @@
-"""Counts of a loop, lines of the log, period of a driver, joints, jobs computed at once."""
+"""Counts of a loop, lines of the log, period of a driver, joints, samples for the fits."""
 
 from collections.abc import Iterable, Mapping
 from math import isnan
@@ -187,24 +187,18 @@ def test_changes_reach_the_joints_that_have_no_value_of_their_own() -> None:
     assert changed.of_joint('elbow')['structure'] == 'proportional'
 
 
-@given(counts=st.lists(st.integers(0, 300), max_size=12), capacity=st.integers(1, 500))
-def test_a_fit_sees_the_newest_samples_with_their_numbers_though_more_come(counts, capacity):
+@given(counts=st.lists(st.integers(0, 300), max_size=12), capacity=st.integers(1, 500),
+       needed=st.integers(0, 2000))
+def test_a_fit_sees_the_newest_samples_it_needs_with_their_numbers(counts, capacity, needed):
     recorder, seen = Recorder(capacity), []
     end = 0
     for count in counts:
         for k in range(end, end + count):
             recorder.append(k, -k, 0.5)
         end += count
-        seen.append((end, recorder.since(end - capacity)))
-    for end, window in seen:
-        numbers = list(range(max(end - capacity, 0), end))
-        assert (window.first, window.end) == (max(end - capacity, 0), end)
+        first = min(max(end - capacity, needed), end)
+        seen.append((first, end, recorder.since(first)))
+    for first, end, window in seen:
+        numbers = list(range(first, end))
+        assert (window.first, window.end) == (first, end)
         assert (window.v.tolist(), window.y.tolist()) == (numbers, [-k for k in numbers])
-
-
-def test_a_fit_sees_no_samples_before_those_it_needs() -> None:
-    recorder = Recorder(1000)
-    for k in range(20):
-        recorder.append(k, k, k)
-    for since in (15, 19, 20):
-        assert recorder.since(since).v.tolist() == [*range(since, 20)]
