@@ -18,8 +18,6 @@ PARAMETERS = Parameters({'estimator.law': 'lms', 'output_noise_std': 1e-4})
 LATENCY_S = 0.0004
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 MULTI_ARRAY = 'std_msgs/msg/Float64MultiArray'
-
-
 FLOAT = 'std_msgs/msg/Float64'
 
 

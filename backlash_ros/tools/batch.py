@@ -19,7 +19,6 @@ from backlash_ros.core.parameters import Parameters, Value
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.run_record import SETTLING_TOLERANCE
 from backlash_ros.tools import cli
-from backlash_ros.tools.cli import BrokenOffError, InputError
 from backlash_ros.tools.config import parse_setting
 from backlash_ros.tools.runs.read_run import run_loop
 from backlash_ros.tools.runs.summary import summarise
@@ -46,13 +45,13 @@ def combinations(texts: Sequence[str]) -> list[dict[str, Value]]:
     for text in texts:
         name, _, listed = map(str.strip, text.partition('='))
         if name in sweeps:
-            raise InputError(f'--sweep names {name} twice')
+            raise cli.InputError(f'--sweep names {name} twice')
         try:
             values = yaml.safe_load(f'[{listed}]')
         except yaml.YAMLError:
             values = []
         if not values:
-            raise InputError(f'--sweep {text!r} must be KEY=v1,v2,... in YAML')
+            raise cli.InputError(f'--sweep {text!r} must be KEY=v1,v2,... in YAML')
         sweeps[name] = [parse_setting(f'{name}={value}')[-1] for value in values]
     return [dict(zip(sweeps, values, strict=True)) for values in product(*sweeps.values())]
 
@@ -77,7 +76,7 @@ def run_job(job: Job) -> Outcome:
     parameters, samples = job
     try:
         summary = summarise(run_loop(build_closed_loop(parameters), samples), parameters)
-    except BrokenOffError as error:
+    except cli.BrokenOffError as error:
         return {**dict.fromkeys(OUTCOME_COLUMNS), 'problem': str(error)}
     summary |= {f'{prefix}{name}': summary[group][name]
                 for prefix, group in OUTCOME_GROUPS.items() for name in BACKLASH}
@@ -114,7 +113,7 @@ def _in_processes(jobs: Sequence[Job], workers: int) -> Iterator[Outcome]:
             raise KeyboardInterrupt
         yield from outcomes
     except BrokenProcessPool:
-        raise BrokenOffError('a worker process was killed: is there enough memory?') from None
+        raise cli.BrokenOffError('a worker process was killed: is there enough memory?') from None
     finally:
         for worker in multiprocessing.active_children():
             worker.kill()  # it has nothing to save
@@ -130,7 +129,7 @@ def _on_cluster(jobs: Sequence[Job], address: str) -> Iterator[Outcome]:
     try:
         from distributed import Client, KilledWorker, TimeoutError
     except ImportError:
-        raise InputError(
+        raise cli.InputError(
             "--cluster needs Dask, which is not installed: pip install 'backlash_ros[cluster]'"
         ) from None
     logging.getLogger('distributed').setLevel(logging.CRITICAL)
@@ -141,11 +140,11 @@ def _on_cluster(jobs: Sequence[Job], address: str) -> Iterator[Outcome]:
             for future in client.map(run_job, jobs, pure=False):
                 yield future.result()
     except (KilledWorker, CancelledError):
-        raise BrokenOffError(f'--cluster {address}: a run has ended several workers, or the '
+        raise cli.BrokenOffError(f'--cluster {address}: a run has ended several workers, or the '
                              'scheduler has ended: is there enough memory?') from None
     except (OSError, ValueError, ImportError, TimeoutError) as error:
         reason = ' '.join(str(error).split()) or type(error).__name__
-        raise InputError(
+        raise cli.InputError(
             f'--cluster {address}: {reason}: start a scheduler with `dask scheduler --host HOST`, '
             'and workers that have this backlash_ros with `dask worker tcp://HOST:8786`'
         ) from None
@@ -158,7 +157,7 @@ def statistics(outcomes: Sequence[Outcome]) -> dict[str, tuple[float, ...]]:
     """
     whole = [outcome for outcome in outcomes if not outcome['problem']]
     if not whole:
-        raise InputError(f'every run broke off, the first one with: {outcomes[0]["problem"]}')
+        raise cli.InputError(f'every run broke off, the first one with: {outcomes[0]["problem"]}')
     found = {}
     for name in BACKLASH:
         final, truth, settling = (np.array([one[f'{prefix}{name}'] for one in whole], dtype=float)

@@ -23,6 +23,7 @@ from backlash_ros.tools.config import parse_setting
 from backlash_ros.tools.records.reading import read_run_or_log
 from backlash_ros.tools.report import REPORT_PAGE, write_report
 from backlash_ros.tools.runs.files import Run, result_directory, write_table
+from backlash_ros.tools.runs.summary import estimate_cells
 from backlash_ros.topics import BACKLASH
 
 
@@ -102,9 +103,8 @@ def _one(path: Path, source: Run, parameters: Parameters, out: Path | None) -> N
     write_atomically(directory / 'replay.png',
                      figures.png(figures.draw_estimates(replayed, recorded)))
     print(cli.format_table(('', 'run', 'replay', '±'), [
-        (name, cli.number(recorded.column(name)[-1], 6), cli.number(summary['final'][name], 6),
-         cli.number(summary['final_std'][name], 2)) for name in BACKLASH
-    ]))
+        (name, cli.number(recorded.column(name)[-1], 6), *estimate_cells(summary, name)[:2])
+        for name in BACKLASH]))
     status, parted = replayed.column('status'), parting(recorded, replayed)
     if not recorded.has_estimates:  # there is nothing to compare with
         begins = np.append(0, np.flatnonzero(np.diff(status)) + 1)

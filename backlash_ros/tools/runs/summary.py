@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.simulation import run_record
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
-from backlash_ros.tools.cli import NOTHING, BrokenOffError, InputError, format_table
+from backlash_ros.tools.cli import NOTHING, BrokenOffError, InputError, format_table, number
 from backlash_ros.tools.runs.read_run import run_loop
 from backlash_ros.topics import BACKLASH
 
@@ -73,11 +72,11 @@ def estimate_cells(summary: Mapping[str, Any], name: str) -> tuple[str, ...]:
     """What a summary has on m, c_r or c_l, as the texts below ESTIMATE_HEADER."""
     final, std, truth, settled = (
         summary[group][name] for group in ('final', 'final_std', 'truth', 'settling_time_s'))
-    known = f'{final:.6g}', f'{std:.2g}' if isfinite(std) else NOTHING
+    known = number(final, 6), number(std, 2)
     if truth is None:
         return *known, NOTHING, NOTHING, NOTHING
     error = f'{100.0 * (final - truth) / abs(truth):+.3g} %' if truth else NOTHING
-    return *known, f'{truth:.6g}', error, 'never' if settled is None else f'{settled:.4g} s'
+    return *known, number(truth, 6), error, 'never' if settled is None else number(settled, 4, 's')
 
 
 def estimate_table(summary: Mapping[str, Any], title: str = '') -> str:
