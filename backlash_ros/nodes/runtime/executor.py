@@ -9,7 +9,6 @@ from typing import Any, cast
 
 from lifecycle_msgs.srv import ChangeState
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from rclpy.exceptions import InvalidHandle
 from rclpy.executors import SingleThreadedExecutor, TimeoutException
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
@@ -50,7 +49,7 @@ def refuse_unfit_transitions(node: Node) -> None:
 
 
 class PromptExecutor(SingleThreadedExecutor):
-    """Serves the subscriptions of one node at once, all else after them.
+    """Serves the subscriptions of one node at once, all else after them; no timer is cancelled.
 
     The executor of rclpy makes a new wait set of everything for each message, which takes longer
     than to answer it. This one keeps one of the urgent, calls timers when they are due, and five
@@ -116,20 +115,15 @@ class PromptExecutor(SingleThreadedExecutor):
         if now + ahead_ns < self._look_at_ns:
             return
         for timer in list(self._node.timers):
-            try:
-                due_ns = timer.time_until_next_call()
-                if due_ns is None or due_ns > ahead_ns:
-                    continue
+            if timer.time_until_next_call() <= ahead_ns:
                 timer.handle.call_timer()
-            except InvalidHandle:  # the callback of another one has destroyed it
-                continue
-            timer.callback()
-            if time.monotonic_ns() > now + 1_000_000:
-                return  # a message may wait: what else is due comes after it
+                timer.callback()
+                if time.monotonic_ns() > now + 1_000_000:
+                    return  # a message may wait: what else is due comes after it
         if now + ahead_ns >= self._rclpy_at_ns:
             self._rclpy_at_ns = now + (0 if self._serve_rest() else look_ns)
-        due = [timer.time_until_next_call() for timer in self._node.timers]
-        wait_ns = min((ns for ns in due if ns is not None), default=look_ns)
+        wait_ns = min((timer.time_until_next_call() for timer in self._node.timers),
+                      default=look_ns)
         self._look_at_ns = min(now + max(wait_ns, 0), self._rclpy_at_ns)
 
     def _serve_rest(self) -> bool:
