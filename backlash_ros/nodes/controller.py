@@ -49,7 +49,7 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
         p = self.settings
         check_style(p)
         self.active = False
-        self._io = DriverIo(self, p)
+        self._io = DriverIo(self)
         # Whoever waits for the others begins with them; who does not may have been restarted.
         counter = SampleCounter(
             p.sample_period, from_zero=not p.lockstep and p.wait_for_subscribers > 0
@@ -127,7 +127,7 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
         self.configured = True
         for joint in self.joints:
             joint.loop = self.loops.by_name[joint.name]
-            joint.model.publish(joint.loop, joint.p)
+            joint.publish_model()
             e = joint.loop.estimate
             if e.learned:
                 self.log.info(
@@ -182,7 +182,7 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
                 self.loops.end(self.settings.on_stop)
                 self._send_last()
                 for joint in self.joints:
-                    joint.model.publish(joint.loop, joint.p, wait_s=1)
+                    joint.publish_model(wait_s=1)
             self._rivals.follow(active=False)
             self._diagnose()
         return TransitionCallbackReturn.SUCCESS
@@ -267,7 +267,7 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
         self._steps.publish(self.loops.by_name, steps)
         for joint in self.joints:
             if joint.name in steps:
-                joint.model.follow(joint.loop, joint.p)
+                joint.follow_model()
         if news := next((joint for joint in self.joints if joint.told != joint.state), None):
             self._diagnose(news)
 

@@ -33,7 +33,7 @@ class ReferenceNode(ProcessNode):
         self._offset_s = 0.0  # keeps the phase where the frequency changes
         self._newest = 0  # sample that was published last
         self._loop_runs_at = inf  # since then, as the controller tells [s]
-        self._io = DriverIo(self, p)
+        self._io = DriverIo(self)
         self._output = self.create_publisher(
             Float64, topics.REFERENCE, messages.KEPT_QOS if p.lockstep else messages.DEPTH
         )

@@ -1,16 +1,22 @@
-"""Joints of the controller: what /diagnostics says of their loops, and what can be asked."""
+"""Joints of the controller: what it says of their loops and their G, and what can be asked."""
 
 import time
+from array import array
 from collections.abc import Callable, Mapping, Sequence
 from concurrent import futures
-from math import isnan
+from itertools import chain
+from math import inf, isnan
 from pathlib import Path
 from typing import Any, cast
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.duration import Duration
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.task import Future
+from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 from std_srvs.srv import SetBool, Trigger
 
+from backlash_ros import topics
 from backlash_ros.core.assembly import build_controller, first_guess
 from backlash_ros.core.estimate import save_estimate, worth_saving
 from backlash_ros.core.loop import diagnosis
@@ -18,10 +24,10 @@ from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.loop_statistics import Lately
 from backlash_ros.core.loop.sample_counter import Timing
 from backlash_ros.core.parameters import NOISE, ParameterError, Parameters
-from backlash_ros.core.simulation.run_record import stated_deviations
-from backlash_ros.nodes.control.publishing import ModelPublisher
+from backlash_ros.core.plant.transfer_function import StateModel
+from backlash_ros.core.simulation.run_record import learned_model_of, stated_deviations
 from backlash_ros.nodes.runtime.driver_io import DriverIo
-from backlash_ros.nodes.runtime.messages import DiagnosticsPublisher, line_of
+from backlash_ros.nodes.runtime.messages import NO_EVENTS, DiagnosticsPublisher, line_of
 from backlash_ros.nodes.runtime.process import ProcessNode
 
 
@@ -34,8 +40,15 @@ class Joint:
 
     def __init__(self, node: ProcessNode, name: str, io: DriverIo, loop: ControlLoop) -> None:
         self.name, self.loop = name, loop
-        self.model = ModelPublisher(node, name)
         self._node, self._io = node, io
+        # Who comes late gets the newest ones: G may never change again. More than one, so that a
+        # subscriber that is held up misses none, and one of each joint.
+        newest = QoSProfile(depth=20, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._model = node.create_publisher(
+            Float64MultiArray, topics.of_node(topics.MODEL), newest, event_callbacks=NO_EVENTS
+        )
+        # The newest one that followed a sample, and the number of that.
+        self._told_model: tuple[StateModel | None, float] = None, -inf
         self.told: object = None
         self._lately = Lately()
         self._diagnostics = DiagnosticsPublisher(
@@ -62,6 +75,30 @@ class Joint:
                 NOISE, p[NOISE], f'is not taken up live by {p.estimator.law}',
                 'clean the node up, set it, and configure again',
             )
+
+    def follow_model(self) -> None:
+        """Publish ~/model when G has changed, else once per second of samples.
+
+        These are counted, so that a run in lockstep is the same whenever it is made.
+        """
+        learned, index = self.loop.core.estimator.learned_model, self.loop.counter.index
+        told, told_index = self._told_model
+        # Deviations and noise change with every few samples, and are of use to a reader.
+        if learned is not told or (index - told_index) * self.p.sample_period >= 1.0:
+            self._told_model = learned, index
+            self.publish_model()
+
+    def publish_model(self, wait_s: int = 0) -> None:
+        """Publish ~/model at once. wait_s: how long at most until who listens has it."""
+        fields = learned_model_of(self.loop.core.estimator, self.p)
+        message = Float64MultiArray(data=array('d', chain(*fields.values())))
+        message.layout.dim = [
+            MultiArrayDimension(label=topics.of_joint(label, self.name), size=len(values))
+            for label, values in fields.items()
+        ]
+        self._model.publish(message)
+        if wait_s:
+            self._model.wait_for_all_acked(Duration(seconds=wait_s))
 
     def save(self) -> futures.Future[str] | None:
         """Begin to save the estimates, if worth it; the result says why it failed, if it did."""

@@ -3,7 +3,7 @@
 import time
 from array import array
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache
+from functools import cache, cached_property
 from math import nan
 from typing import Any, NamedTuple, cast
 
@@ -82,19 +82,23 @@ class DriverIo:
 
     publisher: Publisher
 
-    def __init__(self, node: ProcessNode, p: Parameters) -> None:
+    def __init__(self, node: ProcessNode) -> None:
+        p = node.settings
         self.topics = driver_topics(p)
         self._names = {joint: joint or p.io.joint for joint in p.joint_names}  # in messages
         self.skipped, self.seen = dict.fromkeys(p.joint_names, 0), ''
-        self._node, self._p = node, p
+        self._node = node
         self._stamp = 0, 0  # in the header of the newest y, and the number of its message
         self.clock = WallClock()
-        # Whether stamps are those of /clock: the middleware has real time.
-        self.simulated_time = bool(node.get_parameter('use_sim_time').value)
         self._repeats_stamps = False  # since then the time of sending counts
         self._newest: dict[str, float] = {}  # v by joint
         self._referred = JointMessage()  # the newest message of references
         self.heard: dict[str, Subscription] = {}
+
+    @cached_property
+    def simulated_time(self) -> bool:
+        """Whether stamps are those of /clock: the middleware has real time."""
+        return bool(self._node.get_parameter('use_sim_time').value)
 
     @property
     def is_simulated(self) -> bool:
@@ -161,7 +165,8 @@ class DriverIo:
                      info['received_timestamp'] - self.clock.set_ns, number, not of_joints)
             hear({joint: Output(y, *known) for joint, y in values.items()})
 
-        return self.listen_to(self.topics.output, hear_output, output_qos(self._p, depth), polled)
+        qos = output_qos(self._node.settings, depth)
+        return self.listen_to(self.topics.output, hear_output, qos, polled)
 
     def listen_to(
         self, topic: str, hear: Callable[[dict[str, float], dict[str, Any], Any], None],
@@ -193,7 +198,7 @@ class DriverIo:
         """What a message says about the joints of this node, by their names."""
         names, values = self._names, cast(Sequence[float], message)
         if isinstance(message, JointMessage):
-            values = getattr(message, self._p.io.field)
+            values = getattr(message, self._node.settings.io.field)
             if any(names.values()):
                 found = dict(zip(message.name, values, strict=False))
                 return {joint: found[name] for joint, name in names.items() if name in found}
@@ -224,7 +229,7 @@ class DriverIo:
         row, fields = {name: i for i, name in enumerate(self._referred.name)}, {}
         for field in ('position', 'velocity', 'effort'):
             passed = getattr(self._referred, field)
-            if field == self._p.io.field:
+            if field == self._node.settings.io.field:
                 fields[field] = tuple(commands.values())
             elif all(row.get(name, len(passed)) < len(passed) for name in names):
                 fields[field] = tuple(passed[row[name]] for name in names)
@@ -236,7 +241,7 @@ class DriverIo:
         publishers, own_name = node.get_publishers_info_by_topic, node.get_fully_qualified_name()
         # As the middleware has it: rclpy keeps what was asked for, with zeros for "no limit".
         own = [info for info in publishers(v) if name_of(info) == own_name][:1]
-        references, outputs = self.heard[y_m].qos_profile, output_qos(self._p, DEPTH)
+        references, outputs = self.heard[y_m].qos_profile, output_qos(self._node.settings, DEPTH)
         # Of each who is there: what is offered and what is wanted.
         there = {
             y: [(info, info.qos_profile, outputs) for info in publishers(y)],
