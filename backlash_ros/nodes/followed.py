@@ -93,14 +93,14 @@ class ControllerState:
 class ViewerNode(ProcessNode):
     """Knows every controller of the domain, or those of the wanted namespaces.
 
-    labels: which of the messages below `controller/watch` to take; depth: how many may wait.
-    states: by name, in the order in which they were found.
+    labels: which of the messages below `controller/watch` to take. states: by name, in the order in
+    which they were found.
     """
 
-    def __init__(self, name: str, wanted: Sequence[str], labels: Sequence[str], depth: int) -> None:
+    def __init__(self, name: str, wanted: Sequence[str], labels: Sequence[str]) -> None:
         give_way()
         super().__init__(name)
-        self._labels, self._depth = labels, depth
+        self._labels = labels
         self._wanted = tuple(f'/{each.strip("/")}/'.replace('//', '/') for each in wanted) or '/'
         which = ' of ' + ', '.join(wanted) if wanted else ''
         self.awaited = f'waiting for a controller{which} in ROS_DOMAIN_ID=' \
@@ -132,9 +132,9 @@ class ViewerNode(ProcessNode):
             state = ControllerState(found[1], found[2] or '')
             if state.name not in self.states:
                 folder = topic.removesuffix(BACKLASH[0])
+                # A machine that is held up for a second loses no point.
                 state.subscriptions = [self.listen(
-                    Float64, folder + label, partial(state.hear_value, label), self._depth,
-                    polled=True,
+                    Float64, folder + label, partial(state.hear_value, label), 30, polled=True
                 ) for label in self._labels]
                 self.states[state.name] = state
 

@@ -87,8 +87,7 @@ class LiveNode(ViewerNode):
     """Shows the controllers that are wanted."""
 
     def __init__(self, wanted: Sequence[str], server: PageServer) -> None:
-        # A machine that is held up for a second loses no point.
-        super().__init__('live', wanted, LIVE_LABELS, depth=30)
+        super().__init__('live', wanted, LIVE_LABELS)
         self._server = server
 
     def work(self, executor: PromptExecutor) -> None:

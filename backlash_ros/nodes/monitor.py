@@ -44,7 +44,7 @@ class MonitorNode(ViewerNode):
     """Shows the controllers that are wanted, and asks the services of the selected one."""
 
     def __init__(self, wanted: Sequence[str]) -> None:
-        super().__init__('monitor', wanted, BACKLASH, depth=1)
+        super().__init__('monitor', wanted, BACKLASH)
         self._selected = 0
         self._notice, self._notice_ends_s, self._reset_ends_s = '', 0.0, 0.0
         self._client_of: dict[str, Client] = {}

@@ -2,7 +2,6 @@
 
 import re
 import time
-from collections.abc import Mapping
 from io import StringIO
 
 import pytest
@@ -20,16 +19,11 @@ VALUES = {
 LONG = 'plant_output moves against v: reverse it, or the sign of plant.numerator, and so on ' * 2
 
 
-def say(
-    state: ControllerState, message: str, level: int = 0, values: Mapping[str, str] = VALUES,
-    silent_s: float = 0.0,
-) -> None:
+def say(state, message, level=0, values=VALUES, silent_s=0.0):
     state.hear(message, level, {**values}, time.monotonic() - silent_s)
 
 
-def controller(
-    name: str = '/controller', message: str = 'learned', level: int = 0,
-) -> ControllerState:
+def controller(name='/controller', message='learned', level=0):
     state = ControllerState(name)
     say(state, message, level=level)
     return state
