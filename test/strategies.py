@@ -111,16 +111,6 @@ def output_of(model: TransferFunction, u: NDArray[np.float64]) -> NDArray[np.flo
     return np.asarray(signal.lfilter(model.numerator, model.denominator, u))
 
 
-class NoState:
-    """Stands where the state of G is asked for but not used."""
-
-    x_hat = np.zeros(1)
-    x_cov = None
-
-
-NO_STATE = NoState()
-
-
 class KnownInput:
     """Stands in for InputReconstruction where u is known: hand u(k-1) over as y(k)."""
 

@@ -48,8 +48,15 @@ class LawReport:
     failed_fits: int = 0  # fits so far without a result
 
 
-class StateSource:
-    """Knows the state of G, or does not."""
+class Law:
+    """Learns (m, c_r, c_l), and f where it adapts it, from v and y alone.
+
+    Laws inherit from here what they do not do themselves.
+    """
+
+    RETUNED: ClassVar[tuple[str, ...]] = ()  # names of the parameters that `retune` takes up
+    estimate: Estimate
+    adapting: bool = True  # whether it learns; otherwise it follows the state of G alone
 
     @property
     def x_hat(self) -> Sequence[float] | Array:
@@ -60,17 +67,6 @@ class StateSource:
     def x_cov(self) -> Array | None:
         """Covariance of x_hat, shape (n, n); None where there is none."""
         return None
-
-
-class Law(StateSource):
-    """Learns (m, c_r, c_l), and f where it adapts it, from v and y alone.
-
-    Laws inherit from here what they do not do themselves.
-    """
-
-    RETUNED: ClassVar[tuple[str, ...]] = ()  # names of the parameters that `retune` takes up
-    estimate: Estimate
-    adapting: bool = True  # whether it learns; otherwise it follows the state of G alone
 
     def update(self, y: float | None, interval: Interval) -> None:
         """Take in y(k), None if it was lost, and what was applied from k-1 to k."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import isnan, nan
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from backlash_ros.core.control.structure import ControlInput, ControlStructure
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.estimation.settings import OUTLIERS
 from backlash_ros.core.jobs import LOST, Channel, Executor, Failure
-from backlash_ros.core.law import Interval, Law, StateSource
+from backlash_ros.core.law import Interval, Law
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.actuator import Actuator, Motor
@@ -150,7 +150,8 @@ class AdaptiveController:
                 self._serial.adopt(self._serial.before(model))
 
     @property
-    def _source(self) -> StateSource:
+    def _source(self) -> Law:
+        """What knows the state of the plant of v."""
         return self.estimator if self._serial is None else self._serial.observer
 
 
@@ -176,7 +177,7 @@ class Redesign:
             if job is None:
                 self._gains = ()  # the better G alone takes over
             else:
-                self.channel.submit(_designed, job)
+                self.channel.submit(job)
         found = self.channel.poll()
         if isinstance(found, Failure):
             if found.kind == LOST:
@@ -184,7 +185,7 @@ class Redesign:
             else:
                 self.failed += 1
         elif found is not None:
-            self._gains, = found
+            self._gains = found
         if self._gains is None:
             return None
         self._waited += 1
@@ -194,12 +195,7 @@ class Redesign:
         return gains
 
 
-def _designed(make: Callable[[], object | None]) -> tuple[object | None]:
-    """Gains, or None where the present ones are safer, as a result that is never None."""
-    return make(),
-
-
-class SerialPlant(StateSource):
+class SerialPlant:
     """A motor with its position loop L(z), and G behind it, as one plant of the command.
 
     Where v is the position of a motor encoder, the estimator learns G from that; the structure

@@ -12,7 +12,7 @@ import numpy as np
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.limits import Limits
 from backlash_ros.core.estimate import Estimate, Status
-from backlash_ros.core.law import StateSource
+from backlash_ros.core.law import Law
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.backlash import GAP, LEFT, RIGHT, Region
 from backlash_ros.core.plant.numerics import FourBlocks
@@ -32,7 +32,7 @@ class ControlInput(NamedTuple):
     y_m: float
     y: float
     estimate: Estimate
-    source: StateSource
+    source: Law  # of x_hat
     limits: Limits = Limits()  # that v meets
 
 
@@ -67,13 +67,13 @@ class ControlStructure:
         """What makes gains for a better G in any process, or None if unsafe; None: none to make."""
         return None
 
-    def adopt(self, gains: object, source: StateSource) -> None:
+    def adopt(self, gains: object, source: Law) -> None:
         """Use such gains from the next sample on, without a jump of v; source: of their x_hat."""
 
     def restart(self) -> None:
         """Go on although x_hat begins anew, and the reference may have gone on meanwhile."""
 
-    def retune(self, p: Parameters, source: StateSource) -> None:
+    def retune(self, p: Parameters, source: Law) -> None:
         """Take up new values of live parameters from the next sample on; source: as in `adopt`."""
 
 

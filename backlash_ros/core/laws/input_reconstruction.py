@@ -60,8 +60,7 @@ class InputReconstruction:
         self._step[n, n] = 1.0
         self._step[n + 1:, n:-1] = np.eye(lag)
         try:
-            before = self._stationary(n + 1)
-            gain, self._covariance = self._corrected(before)
+            gain, self._covariance = self._corrected(self._stationary())
             variance = float(self._covariance[-1, -1])
         except (np.linalg.LinAlgError, ValueError):
             variance = nan
@@ -78,21 +77,16 @@ class InputReconstruction:
         self._z: Array = np.append(np.zeros(n + 1 + lag), nan)  # given y(..k), and its innovation
         self._since_loss = 4 * lag
 
-    def _stationary(self, size: int) -> Array:
-        """Covariance of z before a measurement when no sample was ever lost; size: of (x, u)."""
-        unit, step = np.eye(size), self._step[:size, :size]
-        process, output = np.outer(unit[-1], unit[-1]), self._c * unit[0]
+    def _stationary(self) -> Array:
+        """Covariance of z before a measurement when no sample was ever lost."""
+        unit, step = np.eye(len(self._step)), self._step
+        process, output = np.diag(unit[-1 - self.lag]), self._c * unit[0]
         p = riccati(step.T, output / sqrt(self._noise), process)
         for _ in range(100):  # filtering takes out what rounding has left there for little noise
             gain = p @ output / (output @ p @ output + self._noise)
             rest = unit - np.outer(gain, output)
             p = step @ (rest @ p @ rest.T + self._noise * np.outer(gain, gain)) @ step.T + process
-        as_if_resting = np.minimum(np.arange(size + self.lag), size - 1)
-        covariance: Array = p[np.ix_(as_if_resting, as_if_resting)]
-        for _ in range(self.lag):
-            covariance = self._propagated(self._corrected(covariance)[1])
-            covariance[:size, :size] = p
-        return covariance
+        return p
 
     @property
     def u_hat(self) -> float:

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import signal
-from strategies import NO_STATE, PAPER_DENOMINATOR, PAPER_NUMERATOR, Play, plants, usual_plays
+from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR, Play, plants, usual_plays
 
 from backlash_ros.core import Estimate, Parameters, build_closed_loop
 from backlash_ros.core.assembly import build_four_blocks, build_structure
@@ -26,6 +26,7 @@ from backlash_ros.core.control.tracking.design import (
     preview_gains,
 )
 from backlash_ros.core.control.tracking.trajectory import ReferenceWindow
+from backlash_ros.core.law import Law
 from backlash_ros.core.parameters import ParameterError
 from backlash_ros.core.plant.numerics import place_poles
 from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
@@ -38,7 +39,7 @@ def estimate_of(play: Play, f_over_m: float) -> Estimate:
 
 
 def control(y_m: float, estimate: Estimate, inverse: BacklashInverse) -> Command:
-    return Proportional().control(ControlInput(y_m, 0.0, estimate, NO_STATE), inverse)
+    return Proportional().control(ControlInput(y_m, 0.0, estimate, Law()), inverse)
 
 
 def tolerance(play: Play, y_m: float, u_d: float) -> float:

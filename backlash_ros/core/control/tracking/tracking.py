@@ -11,7 +11,7 @@ from backlash_ros.core.control.structure import Command, ControlInput, ControlSt
 from backlash_ros.core.control.tracking.design import TrackingDesign, better_design, design
 from backlash_ros.core.control.tracking.feedback import OFF, Rest, StateFeedback, shrunk_crossings
 from backlash_ros.core.control.tracking.trajectory import IdealTrajectory
-from backlash_ros.core.law import StateSource
+from backlash_ros.core.law import Law
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import TrackingWeights
 from backlash_ros.core.plant.backlash import GAP, LEFT, RIGHT, Region
@@ -54,7 +54,7 @@ class Tracking(ControlStructure):
         self._engaged_for = 0  # samples since v has crossed the gap
         # y, the covariance of x_hat and who knows both, of a command that the next one was not
         # prepared after.
-        self._newest: tuple[float, Array | None, StateSource] | None = None
+        self._newest: tuple[float, Array | None, Law] | None = None
 
     @property
     def may_change(self) -> bool:
@@ -76,7 +76,7 @@ class Tracking(ControlStructure):
         self.feedback.restart()
         self.hand_over = HandOver(due=self.trajectory.u, widens=True, leading=True)
 
-    def retune(self, p: Parameters, source: StateSource) -> None:
+    def retune(self, p: Parameters, source: Law) -> None:
         feedback, tuning = self.feedback, (
             p.tracking, p.inverse.caution, p.estimator.output_noise_std)
         if tuning != (self._weights, feedback.shrinkage, feedback.y_std):
@@ -87,7 +87,7 @@ class Tracking(ControlStructure):
     def redesign(self, model: StateModel) -> Callable[[], object | None]:
         return partial(better_design, model, self._weights, self.trajectory.design)
 
-    def adopt(self, gains: object, source: StateSource) -> None:
+    def adopt(self, gains: object, source: Law) -> None:
         """Go on with a design as if it had been in use for as long as references are kept."""
         assert isinstance(gains, TrackingDesign)
         self.prepare()
@@ -96,7 +96,7 @@ class Tracking(ControlStructure):
         self.feedback.prepare(source.x_cov, self._noise_std, *self.trajectory.noise)
         self._change_trajectory(source)
 
-    def _change_trajectory(self, source: StateSource) -> None:
+    def _change_trajectory(self, source: Law) -> None:
         """Be where the trajectory in use would be, and let v go on from where it is."""
         trajectory, feedback = self.trajectory, self.feedback
         if trajectory.references.empty:
