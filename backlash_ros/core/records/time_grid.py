@@ -182,13 +182,10 @@ def on_grid(rows: Rows, period: float | None = None, late: bool = False) -> Reco
             for signal in (rows.y, rows.v) if signal.ndim == 1) > 0.05:
         return _numbered_grid(rows, found.numbers, used, f'{come}, the motion is even: rows are '
                               f'numbered, one every {seconds(used)}')
-    begin = float(rows.t[0])
-    if period is None and np.abs(found.off).max() <= 0.5 * used:
-        begin = found.begin
-    else:
-        used = guess
-    return _true_instants(rows, begin, used, f'{come}: v and y are taken at them, for samples of '
-                          f'{seconds(used)}')
+    on_a_line = period is None and np.abs(found.off).max() <= 0.5 * used
+    begin, step = (found.begin, used) if on_a_line else (float(rows.t[0]), guess)
+    return _true_instants(rows, begin, step, f'{come}: v and y are taken at them, for samples of '
+                          f'{seconds(step)}')
 
 
 def _period(t: Array) -> float:

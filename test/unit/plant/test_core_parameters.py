@@ -29,12 +29,6 @@ def refusal_of(name: str, value: object) -> str:
     return message
 
 
-def something_valid(parameter: Parameter) -> float:
-    if parameter.low > -inf:
-        return min(parameter.low + 1.0, 0.5 * (parameter.low + parameter.high))
-    return parameter.high - 1.0 if parameter.high < inf else 1.0
-
-
 def build_everything(values: dict[str, object]) -> None:
     p = Parameters(values)
     build_reference(p)
@@ -144,7 +138,7 @@ def test_what_is_no_list_of_that_many_numbers_is_refused(parameter: Parameter) -
         refusal_of(parameter.name, [])
     if parameter.length is not None:
         for count in (parameter.length - 1, parameter.length + 1):
-            message = refusal_of(parameter.name, [something_valid(parameter)] * count)
+            message = refusal_of(parameter.name, [1.0] * count)
             assert f'must have {parameter.length} numbers' in message
 
 
