@@ -89,7 +89,8 @@ class ControlLoop:
 
     @property
     def counted(self) -> dict[str, int]:
-        return self.statistics.by_name() | {'dead_workers': self.executor.restarts}
+        own = {'wraps': self.statistics.wraps, 'dead_workers': self.executor.restarts}
+        return self.statistics.by_name() | own
 
     @property
     def estimate(self) -> Estimate:

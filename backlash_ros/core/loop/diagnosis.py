@@ -146,15 +146,16 @@ class Learning(NamedTuple):
 class LoopFigures(Counts):
     """What the controller knows of the last few seconds; the counts are those gained in them.
 
-    dead_workers: processes for fits that died in them. silent_s: timeout that has passed without y,
-    0 if it has not; reference_silent_s: likewise, inf before the first y_m. still: newest values of
-    y in a row that are equal within its noise. v_swing: how far v has moved meanwhile, and gap, nan
-    while it is not learned [unit of v].
+    wraps: times that y jumped by 2 pi in them; dead_workers: processes for fits that died.
+    silent_s: timeout that has passed without y, 0 if it has not; reference_silent_s: likewise, inf
+    before the first y_m. still: newest values of y in a row that are equal within its noise.
+    v_swing: how far v has moved meanwhile, and gap, nan while it is not learned [unit of v].
     """
 
     timing: Timing
     around: Neighbours
     learning: Learning
+    wraps: int = 0
     dead_workers: int = 0
     standing_down: bool = False
     silent_s: float = 0.0

@@ -22,8 +22,8 @@ class Counts:
     unsent: int = 0  # of these, the ones that the driver never published
     late: int = 0  # commands that missed their sample
     unreported: int = 0  # outputs without a matching report while reports are used
+    interruptions: int = 0  # times that the driver was silent or restarted
     limited: int = 0  # commands that met a limit
-    wraps: int = 0  # times that y jumped by 2 pi
 
     @property
     def dropped(self) -> int:
@@ -43,13 +43,13 @@ class Counts:
 class LoopStatistics(Counts):
     """Counts since the loop began, and what tells how well it runs now.
 
-    interruptions: times that the driver was silent or restarted. still: newest values of y in a row
-    that are equal within still_band; still_v: lowest and highest v meanwhile. v_range: those since
-    they were asked for. inconsistent: newest samples in a row that contradict the estimate.
-    latencies [s]: the newest ones, as topics.py defines them.
+    wraps: times that y jumped by 2 pi. still: newest values of y in a row that are equal within
+    still_band; still_v: lowest and highest v meanwhile. v_range: those since they were asked for.
+    inconsistent: newest samples in a row that contradict the estimate. latencies [s]: the newest
+    ones, as topics.py defines them.
     """
 
-    interruptions: int = 0
+    wraps: int = 0
     still_band: float = 0.0
     still: int = 0
     still_v: tuple[float, float] = (inf, -inf)
