@@ -152,7 +152,7 @@ class WorkerExecutor(Executor):
 
 def _start(preload: tuple[str, ...], loops: int) -> subprocess.Popen[bytes]:
     code = f'import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve; ' \
-        f'serve({preload!r}, {loops})'
+        f'serve({os.getpid()}, {preload!r}, {loops})'
     process = subprocess.Popen(
         [sys.executable, '-c', code], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
         # In a session of its own it gets no Ctrl-C, not even while it starts, and what it takes of
@@ -179,12 +179,14 @@ def _send(stream: IO[bytes], body: bytes) -> None:
 # --- in the worker ------------------------------------------------------------------------------
 
 
-def serve(preload: Sequence[str], loops: int) -> None:
+def serve(parent: int, preload: Sequence[str], loops: int) -> None:
     """Compute jobs that come through the standard input, until it or the parent ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)
     # PR_SET_PDEATHSIG: it ends with the thread that started it, also while a job is computed.
     ctypes.CDLL(None).prctl(1, signal.SIGKILL)
+    if os.getppid() != parent:
+        return  # it has ended before that
     results = os.fdopen(os.dup(1), 'wb')
     os.dup2(2, 1)  # what a job prints is no result
     for name in preload:

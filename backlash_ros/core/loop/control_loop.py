@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import Enum
 from functools import partial
 from itertools import cycle
@@ -15,7 +15,7 @@ from backlash_ros.core.control.limits import Motion, at_rest, last_commands, pla
 from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.jobs import Executor
 from backlash_ros.core.loop.command_history import CommandHistory, report_use
-from backlash_ros.core.loop.loop_statistics import LoopStatistics
+from backlash_ros.core.loop.loop_statistics import Counts, LoopStatistics
 from backlash_ros.core.loop.sample_counter import NEXT_SAMPLE, Arrival, Output, SampleCounter
 from backlash_ros.core.parameters import Parameters
 
@@ -89,8 +89,9 @@ class ControlLoop:
 
     @property
     def counted(self) -> dict[str, int]:
-        own = {'wraps': self.statistics.wraps, 'dead_workers': self.executor.restarts}
-        return self.statistics.by_name() | own
+        names = (*(each.name for each in fields(Counts)), 'wraps')
+        return {name: getattr(self.statistics, name) for name in names} | {
+            'dead_workers': self.executor.restarts}
 
     @property
     def estimate(self) -> Estimate:

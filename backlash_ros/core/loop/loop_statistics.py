@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from math import inf, nan, pi
 
 import numpy as np
@@ -34,9 +34,6 @@ class Counts:
     def heard(self) -> int:
         """Samples that have come, whatever they were worth."""
         return self.used + self.without_reference + self.bad_outputs
-
-    def by_name(self) -> dict[str, int]:
-        return {each.name: getattr(self, each.name) for each in fields(Counts)}
 
 
 @dataclass
