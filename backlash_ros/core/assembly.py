@@ -9,12 +9,7 @@ from backlash_ros.core.control.controller import DOUBT, AdaptiveController, Seri
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.limits import Limits, check_last_commands
 from backlash_ros.core.control.structure import ControlStructure, PolePlacement, Proportional
-from backlash_ros.core.control.tracking.design import (
-    better_design,
-    design,
-    power_gain,
-    preview_gains,
-)
+from backlash_ros.core.control.tracking.design import better_design, design, feedback_around
 from backlash_ros.core.control.tracking.tracking import Tracking
 from backlash_ros.core.estimate import Estimate, load_estimate
 from backlash_ros.core.estimation.estimator import MovingHorizon, fitted
@@ -119,10 +114,9 @@ def build_structure(p: Parameters) -> ControlStructure:
 def build_four_blocks(p: Parameters) -> FourBlocks:
     """The gains of `pole_placement`, placed where those of `tracking` put the poles of G."""
     state = build_state_model(p, commanded=True)
-    model = state.transfer_function
-    gains = preview_gains(state, p.tracking.input_weight * power_gain(model, np.pi / 10.0))
+    gains = feedback_around(state, p.tracking._replace(integral_weight=0.0))
     closed = np.real(np.poly(state.a - np.outer(state.b, gains.state)))
-    return place_poles(model, closed, p.pole_placement.filter_pole)
+    return place_poles(state.transfer_function, closed, p.pole_placement.filter_pole)
 
 
 def build_limits(p: Parameters) -> Limits:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from math import floor, inf, isnan, sqrt
+from math import copysign, floor, inf, isnan, sqrt
 from typing import NamedTuple
 
 from backlash_ros.core.parameters import ParameterError, Parameters
@@ -83,10 +83,7 @@ class Limits:
 
     def stop(self, before: Motion) -> Motion:
         """The next motion on the shortest way to rest."""
-        if self.acceleration == inf or before.move == 0.0:
-            return at_rest(before.v)
-        less = max(abs(before.move) - self.acceleration, 0.0)
-        move = less if before.move > 0.0 else -less
+        move = copysign(max(abs(before.move) - self.acceleration, 0.0), before.move)
         return Motion(before.v + move, move, before.v + move)
 
     def samples_across(self, distance: float) -> float:

@@ -30,21 +30,6 @@ from backlash_ros.core.plant.numerics import FourBlocks
 from backlash_ros.core.plant.transfer_function import Array
 
 
-class Filters:
-    """W of phi and of u_d, and what returns of y, side by side in observer form."""
-
-    def __init__(self, blocks: FourBlocks) -> None:
-        models = [*[blocks.disturbance.state_space()] * 4, blocks.returned.state_space()]
-        self.a, self.b = models[0][0], np.column_stack([b for _, b, _ in models])
-        self.x: Array = np.zeros(self.b.shape)
-
-    def step(self, inputs: Array) -> list[float]:
-        """Outputs (5,) after phi, u_d and y (5,)."""
-        self.x = self.a @ self.x + self.b * inputs
-        outputs: list[float] = self.x[0].tolist()
-        return outputs
-
-
 @dataclass
 class Means:
     """Running means of v^2, u_d^2 and zeta' P zeta, by which the adaptation is normalised."""
@@ -69,7 +54,10 @@ class GradientEstimator(Law):
     ) -> None:
         self.estimate, self.step = initial, step
         self._bounds, self._noise_square = bounds, (10.0 * noise_std) ** 2
-        self._agreement, self._filters, self._means = Agreement(), Filters(blocks), Means()
+        self._agreement, self._means = Agreement(), Means()
+        # W of phi and of u_d, and what returns of y, each with its state in the observer form.
+        self._filters = [(model, [0.0] * model.order) for model in (
+            *[blocks.disturbance] * 4, blocks.returned)]
         self._y = 0.0  # the newest one, or what was expected of it
         self._phi: Array = np.zeros(3)
 
@@ -78,8 +66,9 @@ class GradientEstimator(Law):
         self._phi = self._engaged(interval, old)
         theta = np.array([old.m, old.m * old.c_r, old.m * old.c_l])
         self.u_hat = float(theta @ self._phi)
-        inputs = np.concatenate((self._phi, (interval.u_d, self._y)))
-        *of_phi, demanded, returned = self._filters.step(inputs)
+        inputs = *self._phi.tolist(), interval.u_d, self._y
+        *of_phi, demanded, returned = (
+            model.advance(x, u) for (model, x), u in zip(self._filters, inputs, strict=True))
         zeta = np.array(of_phi)
         means.samples += 1
         share = 1.0 / min(means.samples, MEMORY)

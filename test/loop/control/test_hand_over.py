@@ -9,7 +9,7 @@ from strategies import GEAR, known_backlash
 from backlash_ros.core import Parameters, build_closed_loop, build_controller
 from backlash_ros.core.assembly import build_state_model
 from backlash_ros.core.control.controller import AdaptiveController
-from backlash_ros.core.control.tracking.design import design
+from backlash_ros.core.control.tracking.design import design, feedback_around
 
 PARAMETERS = Parameters({
     **GEAR, **known_backlash(1.0, 0.5, -0.4), 'structure': 'tracking', 'amplitude': 1.0,
@@ -66,3 +66,13 @@ def test_v_goes_on_as_it_moved(take_over, at):
     assert usual < 0.1 * GAP
     assert moves[at] <= 2.0 * usual, 'at once'
     assert np.median(moves[at:at + 8]) <= 3.0 * usual, 'while the difference fades'
+
+
+def test_other_tuning_leaves_feedback_as_soft_as_a_better_g_has_made_it():
+    p, state, softer = PARAMETERS, build_state_model(PARAMETERS), 3.0
+    core = build_controller(p)
+    core.structure.adopt(design(state, p.tracking, softer), core.estimator)
+    core.retune(p.replaced({'inverse.caution': 2.0}))
+    gains = core.structure.trajectory.design.feedback.state
+    assert gains == pytest.approx(feedback_around(state, p.tracking, softer).state)
+    assert gains != pytest.approx(feedback_around(state, p.tracking).state)

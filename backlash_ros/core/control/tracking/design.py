@@ -135,6 +135,7 @@ class TrackingDesign(NamedTuple):
     """Gains of one model of G, shape (n,) where they are of x."""
 
     model: StateModel
+    factor: float  # see feedback_around
     plans: tuple[Plan, ...]  # each weighs u more than the one before, for references with noise
     feedback: PreviewGains  # of the deviations from them
     schedule: tuple[Gain, ...]  # that of full feedback first
@@ -168,7 +169,8 @@ def design(model: StateModel, weights: TrackingWeights, factor: float = 1.0) -> 
     gentle = preview_gains(model, power_gain(model.transfer_function, rest_bandwidth)).state
     ahead, later = (powers(model.a, model.b, k).sum(axis=0) for k in (LOOK_AHEAD, HORIZON))
     return TrackingDesign(
-        model, plans, feedback, schedule, schedule[SOFTEST] if bears else None, gentle.tolist(),
+        model, factor, plans, feedback, schedule, schedule[SOFTEST] if bears else None,
+        gentle.tolist(),
         float(np.linalg.norm(later)), model.c * abs(float(ahead[0])),
         [_agreed(model, gain, len(plans[0].states)) for gain in schedule])
 
@@ -194,7 +196,9 @@ def better_design(
     return None
 
 
-def feedback_around(model: StateModel, weights: TrackingWeights, factor: float) -> PreviewGains:
+def feedback_around(
+    model: StateModel, weights: TrackingWeights, factor: float = 1.0,
+) -> PreviewGains:
     """Of deviations from the trajectory, as if the input weighed so many times as much."""
     rho = weights.input_weight * power_gain(model.transfer_function, np.pi / 10.0)
     return preview_gains(model, factor * rho, weights.integral_weight)

@@ -80,7 +80,8 @@ class Tracking(ControlStructure):
         feedback, tuning = self.feedback, (
             p.tracking, p.inverse.caution, p.estimator.output_noise_std)
         if tuning != (self._weights, feedback.shrinkage, feedback.y_std):
-            gains = design(self.trajectory.design.model, p.tracking)
+            present = self.trajectory.design
+            gains = design(present.model, p.tracking, present.factor)
             self._weights, feedback.shrinkage, feedback.y_std = tuning
             self.adopt(gains, source)
 

@@ -33,7 +33,7 @@ class ReferenceWindow:
         # As they came, as they are used, and what u* makes of noise of 1 in them. Written from the
         # left to the right; when they are full their end moves to the front.
         self._rows: Array = np.zeros((3, 2 * self._kept))
-        self._start = self._end = 0
+        self._end = 0
         self.noise = NoiseLevel()  # of the references as they came
         self.u_noise_gain = float(noise_gains[0])
         self.u_noise_std = self.noise_spread = self.low = self.high = 0.0
@@ -49,11 +49,11 @@ class ReferenceWindow:
 
     def all(self) -> Array:
         """Everything that is kept, the newest last, shape (up to history + N + 1,)."""
-        return self._rows[1, max(self._start, self._end - self._kept):self._end]
+        return self._rows[1, max(0, self._end - self._kept):self._end]
 
     def fill(self, value: float) -> None:
         """Let the window begin with this value everywhere."""
-        self._start, self._end = 0, self._preview + 1
+        self._end = self._preview + 1
         self._rows[:2, :self._end] = value
         self._rows[2, :self._end] = 0.0
 
@@ -77,7 +77,7 @@ class ReferenceWindow:
         self._rows[2, newest] = self.noise_gains[0]
         self.noise.take(self._rows.item(0, newest))
         std = self.noise.std
-        if half and std > 0.0 and newest - self._start >= 2 * half:
+        if half and std > 0.0:
             self._average(newest - half)
         window = self.window
         self.low, self.high = float(window.min()), float(window.max())
@@ -88,7 +88,7 @@ class ReferenceWindow:
             self.u_noise_std = std * self.u_noise_gain
         if self._end == self._rows.shape[1]:
             self._rows[:, :self._kept] = self._rows[:, -self._kept:]
-            self._start, self._end = 0, self._kept
+            self._end = self._kept
 
     def _average(self, at: int) -> None:
         # Mean square of what is left beside a parabola, in those of the noise, up to which the
