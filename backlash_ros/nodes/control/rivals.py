@@ -104,9 +104,8 @@ class RivalWatch(Rivals):
     def __init__(self, node: ProcessNode, io: DriverIo, changed: Callable[[], None]) -> None:
         self.topic = node.resolve_topic_name(io.topics.control)
         self._node, self._changed = node, changed
-        # What discovery mostly takes: a publisher that is found so soon after the node was made was
-        # there before it.
-        super().__init__(self._identity_after(io.advertise), node.begun_at + 0.7)
+        # What discovery mostly takes: a publisher that is found so soon was there before.
+        super().__init__(self._identity_after(io.advertise), time.monotonic() + 0.7)
         self.found: tuple[Rival, ...] = ()
         self._lock = CommandLock(node.context.get_domain_id(), self.topic)
         self._told: tuple[tuple[Rival, ...], bool] = (), False  # at the look before

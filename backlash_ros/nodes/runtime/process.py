@@ -77,8 +77,7 @@ class ProcessNode(Node):
     """A node that is the purpose of its process: parameters checked, then work until stopped.
 
     Its `settings` are complete and checked; all or none of them change. parameters_of: the
-    executable whose parameters it reads. begun_at: from here on the node finds others and is found,
-    on the steady clock [s]. signals: the SIGINT and SIGTERM that have come.
+    executable whose parameters it reads. signals: the SIGINT and SIGTERM that have come.
     """
 
     settings: Parameters
@@ -87,7 +86,6 @@ class ProcessNode(Node):
 
     def __init__(self, executable: str, parameters_of: str = '') -> None:
         super().__init__(executable)
-        self.begun_at = time.monotonic()
         self.log = Node.get_logger(self)
         self.declare_settings(parameters_of or executable)
         self.signals: list[int] = []
