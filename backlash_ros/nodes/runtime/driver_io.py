@@ -5,7 +5,7 @@ from array import array
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, cached_property
 from math import nan
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
@@ -137,12 +137,14 @@ class DriverIo:
         self, hear: Callable[[Mapping[str, Output]], None], depth: int, polled: bool = False,
     ) -> Subscription:
         """Call hear with every y. polled: when serve_polled is called."""
+        numbered = self.topics.types[self.topics.output] is Float64
+
         def hear_output(
             values: dict[str, float], info: dict[str, Any],
             message: tuple[float, ...] | JointMessage,
         ) -> None:
-            stamp_ns, number = 0, info['publication_sequence_number']
-            of_joints = isinstance(message, JointMessage)
+            number, source_ns = info['publication_sequence_number'], info['source_timestamp']
+            stamp_ns = 0
             if isinstance(message, JointMessage):
                 if len(values) < len(self.skipped):
                     self.seen = ', '.join(message.name)
@@ -156,13 +158,14 @@ class DriverIo:
                     self._repeats_stamps = self._repeats_stamps \
                         or self._node.count_publishers(self.topics.output) == 1
                 stamp_ns = 0 if self._repeats_stamps else message.stamp_ns
-            # Drivers that leave the header empty are known by the stamp of the middleware.
             if not self.simulated_time:
-                self.clock.look_now(stamp_ns or info['source_timestamp'])
+                # Drivers that leave the header empty are known by the stamp of the middleware.
+                stamp_ns = stamp_ns or source_ns
+                self.clock.look_now(stamp_ns)
             of_stamps_ns = self.clock.of_stamps_ns
-            known = (stamp_ns - of_stamps_ns if stamp_ns else self.stamp_ns(info),
-                     info['source_timestamp'] - of_stamps_ns,
-                     info['received_timestamp'] - self.clock.set_ns, number, not of_joints)
+            known = (stamp_ns - of_stamps_ns if stamp_ns else self.now_ns(),
+                     source_ns - of_stamps_ns,
+                     info['received_timestamp'] - self.clock.set_ns, number, numbered)
             hear({joint: Output(y, *known) for joint, y in values.items()})
 
         qos = output_qos(self._node.settings, depth)
@@ -196,8 +199,10 @@ class DriverIo:
 
     def values(self, message: Sequence[float] | JointMessage) -> dict[str, float]:
         """What a message says about the joints of this node, by their names."""
-        names, values = self._names, cast(Sequence[float], message)
-        if isinstance(message, JointMessage):
+        names = self._names
+        if not isinstance(message, JointMessage):
+            values = message
+        else:
             values = getattr(message, self._node.settings.io.field)
             if any(names.values()):
                 found = dict(zip(message.name, values, strict=False))
