@@ -147,4 +147,5 @@ class Uninterrupted:
         inverse.direction_band = band
         used = step.estimate if core.compensating else replace(step.estimate, c_r=0.0, c_l=0.0)
         inputs = ControlInput(step.y_m, step.y, used, core.estimator)
-        return core.limits.apply(self._structure.control(inputs, inverse).v, at_rest(v_before)).v
+        self._structure.control(inputs, inverse)
+        return core.limits.apply(inverse.v, at_rest(v_before)).v

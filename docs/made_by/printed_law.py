@@ -5,11 +5,10 @@ from dataclasses import replace
 from itertools import count
 from math import isfinite, sin
 
-import numpy as np
-
 from backlash_ros.core.control.inverse import BacklashInverse
-from backlash_ros.core.control.structure import Command, ControlInput, Proportional
+from backlash_ros.core.control.structure import ControlInput, Proportional
 from backlash_ros.core.estimate import Estimate
+from backlash_ros.core.law import Law
 from backlash_ros.core.laws.lms_and_printed import printed_c, printed_f, printed_m
 from backlash_ros.core.plant.backlash import Backlash
 
@@ -30,16 +29,17 @@ def reference(k: int) -> float:
     return 10.0 * sin(12.6 * k * PERIOD)
 
 
-def command(y_m: float, estimate: Estimate, inverse: BacklashInverse) -> Command:
-    """(3.2) with the inverse (2.3)."""
-    return Proportional().control(ControlInput(y_m, 0.0, estimate, np.zeros(0)), inverse)
+def command(y_m: float, estimate: Estimate, inverse: BacklashInverse) -> float:
+    """u_d of (3.2), with the inverse (2.3)."""
+    return Proportional().control(ControlInput(y_m, 0.0, estimate, Law()), inverse)
 
 
 def estimates() -> Iterator[Estimate]:
     """Backlash, structure (3.2), inverse (2.3) and the law without guards; no plant is needed."""
     backlash, inverse, e, w, u = Backlash(*TRUE), BacklashInverse(), START, START.c_r, 0.0
     for k in count():
-        before, u = u, backlash.step(command(reference(k), e, inverse).v)
+        command(reference(k), e, inverse)
+        before, u = u, backlash.step(inverse.v)
         if u != before:
             w = e.c_r if u > before else e.c_l
         e = updated(e, u, reference(k), w)
@@ -58,8 +58,8 @@ def error_growth(f: float) -> float:
     backlash, inverse = Backlash(*TRUE), BacklashInverse()
     c, errors = c_r + 1e-6, []
     for y_m in (10.0, 10.1, 10.2):  # rises, so that the right side stays engaged
-        given = command(y_m, Estimate(m, c, c_l, f), inverse)
-        u = backlash.step(given.v)
-        errors.append(u - given.u_d)
+        u_d = command(y_m, Estimate(m, c, c_l, f), inverse)
+        u = backlash.step(inverse.v)
+        errors.append(u - u_d)
         c = printed_c(u, y_m, f, m)
     return errors[-1] / errors[-2]

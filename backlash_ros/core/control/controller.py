@@ -95,8 +95,8 @@ class AdaptiveController:
         elif serial is not None:
             used = serial.for_command(estimate)
         inputs = ControlInput(y_m, y, used, self._source, self.limits)
-        u_d, v = self.structure.control(inputs, inverse)
-        self.motion = self.limits.apply(v, self.motion)
+        u_d = self.structure.control(inputs, inverse)
+        self.motion = self.limits.apply(inverse.v, self.motion)
         v = self.motion.v
         inverse.applied(v)
         self._led = v, y_m, u_d

@@ -36,13 +36,6 @@ class ControlInput(NamedTuple):
     limits: Limits = Limits()  # that v meets
 
 
-class Command(NamedTuple):
-    """Desired input u_d of G, and the control v that shall cause it."""
-
-    u_d: float
-    v: float
-
-
 class ControlStructure:
     """Makes u_d from the reference and drives the inverse with it.
 
@@ -56,8 +49,8 @@ class ControlStructure:
         """Whether gains for a better G may take over at this sample."""
         return True
 
-    def control(self, inputs: ControlInput, inverse: BacklashInverse) -> Command:
-        """Return the command of this sample; advances the inverse by one step."""
+    def control(self, inputs: ControlInput, inverse: BacklashInverse) -> float:
+        """Return the desired input u_d of G; advances the inverse to the v that shall cause it."""
         raise NotImplementedError
 
     def prepare(self) -> None:
@@ -87,12 +80,12 @@ class Proportional(ControlStructure):
     def __init__(self) -> None:
         self._estimate: Estimate | None = None  # that v was made with
 
-    def control(self, inputs: ControlInput, inverse: BacklashInverse) -> Command:
-        """Return u_d and v that satisfy (3.2) and (2.3) together."""
+    def control(self, inputs: ControlInput, inverse: BacklashInverse) -> float:
+        """Return u_d so that it and v satisfy (3.2) and (2.3) together."""
         y_m, e, band = inputs.y_m, inputs.estimate, inverse.direction_band
         m, c_r, c_l, f = e.m, e.c_r, e.c_l, min(e.f, LARGEST_F_OVER_M * e.m)
         if f == 0.0 and not inverse.taking_up and inverse.direction(y_m, band) is GAP:
-            return Command(y_m, inverse.v)  # first case of (2.3)
+            return y_m  # first case of (2.3)
         before, self._estimate = self._estimate, e
         if before is not None and before is not e and inverse.take_up < inf:
             # The inverse is slow only as far as u does not move: it cannot tell what u_d, or the
@@ -101,7 +94,8 @@ class Proportional(ControlStructure):
             if abs(now - then) > inverse.take_up:
                 inverse.slow_down()
         if f == 0.0:  # nothing to solve
-            return Command(y_m, inverse.step(y_m, m, c_r, c_l))
+            inverse.step(y_m, m, c_r, c_l)
+            return y_m
         if e.learned:  # turns of u_d by less than three of its standard deviations are noise
             by_m, by_c = f * (y_m + f * c_r) / (m - f) ** 2, m * f / (m - f)
             band = max(band, 3.0 * hypot(by_m * e.std_m, by_c * max(e.std_c_r, e.std_c_l)))
@@ -114,25 +108,25 @@ class Proportional(ControlStructure):
         if inverse.taking_up:
             for side, u_d in solutions:
                 if side is inverse.side and inverse.direction(u_d, band) is GAP:
-                    v = inverse.step(u_d, m, c_r, c_l, band)  # u_d rests, v goes on to its line
-                    return Command(y_m + f * v, v)
+                    # u_d rests, v goes on to its line.
+                    return y_m + f * inverse.step(u_d, m, c_r, c_l, band)
         elif (
             abs(held - inverse.extreme) <= 1e-12 * (abs(held) + abs(v))  # but for rounding
             or inverse.direction(held, band) is GAP
         ):
-            return Command(held, v)  # first case of (3.3): u_d rests, and so does v
+            return held  # first case of (3.3): u_d rests, and so does v
         for side, u_d in solutions:
             if inverse.direction(u_d, band) is side:
-                return Command(u_d, inverse.step(u_d, m, c_r, c_l, band))
+                inverse.step(u_d, m, c_r, c_l, band)
+                return u_d
         if abs(held) > (abs(y_m) + abs(f) * max(c_r, -c_l)) / (1.0 - LARGEST_F_OVER_M):
             # New estimates have moved both lines so far from v that no u_d could have led there.
             side, u_d = solutions[0]
             inverse.aim(u_d, side)
-            v = inverse.proceed(m, c_r, c_l)
-            return Command(y_m + f * v, v)
+            return y_m + f * inverse.proceed(m, c_r, c_l)
         if band == 0.0:
             inverse.extreme = held
-        return Command(held, v)
+        return held
 
 
 def _on_the_line(y_m: float, e: Estimate, side: Region) -> float:
@@ -159,8 +153,8 @@ class PolePlacement(ControlStructure):
         self._largest_asked = 0.0  # largest of it so far
         self.delay = round(blocks.reference.group_delay)
 
-    def control(self, inputs: ControlInput, inverse: BacklashInverse) -> Command:
-        """Return u_d, no further than feedback may go from what r asks for, and v = BI(u_d)."""
+    def control(self, inputs: ControlInput, inverse: BacklashInverse) -> float:
+        """Return u_d, no further than feedback may go from what r asks for."""
         blocks, e, (w_1, w_2) = self._blocks, inputs.estimate, self._w
         u_d = float(blocks.theta_1 @ w_1 + blocks.theta_2 @ w_2)
         u_d += blocks.theta_20 * inputs.y + blocks.theta_3 * inputs.y_m
@@ -172,7 +166,7 @@ class PolePlacement(ControlStructure):
         share = LARGEST_FEEDBACK if e.status is Status.TRACKING else LARGEST_IN_ACQUISITION
         reach = share * max(self._largest_asked, e.m * (e.c_r - e.c_l))
         u_d = min(max(u_d, asked - reach), asked + reach)
-        v = inverse.step(u_d, e.m, e.c_r, e.c_l)
+        inverse.step(u_d, e.m, e.c_r, e.c_l)
         self._w = np.array([self._companion @ w_1, self._companion @ w_2])
         self._w[:, :1] += [[u_d], [inputs.y]]
-        return Command(u_d, v)
+        return u_d

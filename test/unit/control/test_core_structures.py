@@ -13,12 +13,7 @@ from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR, Play, plants, usual_p
 from backlash_ros.core import Estimate, Parameters, build_closed_loop
 from backlash_ros.core.assembly import build_four_blocks, build_structure
 from backlash_ros.core.control.inverse import BacklashInverse
-from backlash_ros.core.control.structure import (
-    LARGEST_F_OVER_M,
-    Command,
-    ControlInput,
-    Proportional,
-)
+from backlash_ros.core.control.structure import LARGEST_F_OVER_M, ControlInput, Proportional
 from backlash_ros.core.control.tracking.design import (
     PreviewGains,
     averages,
@@ -38,7 +33,7 @@ def estimate_of(play: Play, f_over_m: float) -> Estimate:
     return Estimate(play.m, play.c_r, play.c_l, f_over_m * play.m)
 
 
-def control(y_m: float, estimate: Estimate, inverse: BacklashInverse) -> Command:
+def control(y_m: float, estimate: Estimate, inverse: BacklashInverse) -> float:
     return Proportional().control(ControlInput(y_m, 0.0, estimate, Law()), inverse)
 
 
@@ -54,25 +49,25 @@ def test_u_d_is_y_m_plus_f_v_and_v_satisfies_the_printed_inverse_at_the_same_tim
     inverse = BacklashInverse()
     u_d_before, v_before = 0.0, 0.0
     for play, share, y_m in samples:
-        command = control(y_m, estimate_of(play, share), inverse)
-        slack = tolerance(play, y_m, command.u_d)
-        assert command.u_d == pytest.approx(y_m + share * play.m * command.v, abs=slack)
-        assert command.v == inverse.v
+        u_d = control(y_m, estimate_of(play, share), inverse)
+        slack = tolerance(play, y_m, u_d)
+        assert u_d == pytest.approx(y_m + share * play.m * inverse.v, abs=slack)
         if share >= 0.0:
-            turns = (command.u_d - u_d_before, u_d_before - command.u_d)
-            assert any(turn > -slack and abs(command.v - command.u_d / play.m - c) <= slack / play.m
+            turns = (u_d - u_d_before, u_d_before - u_d)
+            assert any(turn > -slack and abs(inverse.v - u_d / play.m - c) <= slack / play.m
                        for turn, c in zip(turns, (play.c_r, play.c_l), strict=True)) \
-                or (max(turns) <= slack and command.v == v_before)
-        u_d_before, v_before = command.u_d, command.v
+                or (max(turns) <= slack and inverse.v == v_before)
+        u_d_before, v_before = u_d, inverse.v
 
 
 @given(play=usual_plays(), y_m=st.floats(-100.0, 100.0),
        share=st.one_of(st.just(1.0), st.floats(0.99, 1.01), st.floats(0.8, 100.0)))
 def test_f_near_or_beyond_m_is_limited(play: Play, y_m: float, share: float) -> None:
-    command = control(y_m, estimate_of(play, share), BacklashInverse())
-    assert isfinite(command.u_d)
-    assert command.u_d == pytest.approx(
-        y_m + LARGEST_SHARE * play.m * command.v, abs=tolerance(play, y_m, command.u_d))
+    inverse = BacklashInverse()
+    u_d = control(y_m, estimate_of(play, share), inverse)
+    assert isfinite(u_d)
+    assert u_d == pytest.approx(
+        y_m + LARGEST_SHARE * play.m * inverse.v, abs=tolerance(play, y_m, u_d))
     assert LARGEST_F_OVER_M == LARGEST_SHARE
 
 
@@ -80,11 +75,11 @@ def test_v_does_not_stay_where_estimates_far_off_have_led_it() -> None:
     inverse = BacklashInverse()
     before, now = Estimate(0.01, 0.0, 0.0, 0.4), Estimate(0.3, 0.0, 0.0, 0.4)
     for y_m in (10.0, -10.0):
-        far = control(y_m, before, inverse)
-    assert far.v < -4000.0
-    command = control(-10.0, now, inverse)
-    assert command.u_d == pytest.approx(-10.0 + LARGEST_SHARE * now.m * command.v)
-    assert abs(command.u_d) <= 1.001 * 10.0 / (1.0 - LARGEST_F_OVER_M)
+        control(y_m, before, inverse)
+    assert inverse.v < -4000.0
+    u_d = control(-10.0, now, inverse)
+    assert u_d == pytest.approx(-10.0 + LARGEST_SHARE * now.m * inverse.v)
+    assert abs(u_d) <= 1.001 * 10.0 / (1.0 - LARGEST_F_OVER_M)
 
 
 PAPER = TransferFunction(PAPER_NUMERATOR, PAPER_DENOMINATOR)

@@ -7,7 +7,7 @@ from functools import partial
 from itertools import pairwise
 
 from backlash_ros.core.control.inverse import BacklashInverse
-from backlash_ros.core.control.structure import Command, ControlInput, ControlStructure
+from backlash_ros.core.control.structure import ControlInput, ControlStructure
 from backlash_ros.core.control.tracking.design import TrackingDesign, better_design, design
 from backlash_ros.core.control.tracking.feedback import OFF, Rest, StateFeedback, shrunk_crossings
 from backlash_ros.core.control.tracking.trajectory import IdealTrajectory
@@ -112,8 +112,8 @@ class Tracking(ControlStructure):
 
     # --- at every sample ------------------------------------------------------------------------
 
-    def control(self, inputs: ControlInput, inverse: BacklashInverse) -> Command:
-        """Return u_d and v = BI(u_d)."""
+    def control(self, inputs: ControlInput, inverse: BacklashInverse) -> float:
+        """Return u_d, and let the inverse make v of it."""
         y_m, y, estimate, source, limits = inputs
         self.prepare()
         plan, feedback, rest, hand_over = self.trajectory, self.feedback, self.rest, self.hand_over
@@ -162,15 +162,15 @@ class Tracking(ControlStructure):
         side_before, v_before, trust = inverse.side, inverse.v, feedback.trust
         if steps:
             shrunk = shrunk_crossings(estimate, rest.target[1], trust.known)
-            v = inverse.proceed(trust.slope, *shrunk)
+            inverse.proceed(trust.slope, *shrunk)
         else:
-            v = inverse.follow(side, u_d, trust.slope, *trust.crossings)
-        self._moves.append(abs(v - v_before))
+            inverse.follow(side, u_d, trust.slope, *trust.crossings)
+        self._moves.append(abs(inverse.v - v_before))
         crosses = inverse.taking_up or inverse.side is not side_before
         self._engaged_for = 0 if crosses else self._engaged_for + 1
         feedback.integrate(plan.design.model.c * plan.x[0] - y, inverse.limited)
         self._newest = y, x_cov, source
-        return Command(u_d, v)
+        return u_d
 
     def prepare(self) -> None:
         """Go on to the next sample, if that is still to be done."""
