@@ -10,8 +10,6 @@ trajectory, and otherwise moves in single steps. Full feedback brings back all t
 less it would leave to itself, as noise, until it is far away.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum, auto
