@@ -131,7 +131,7 @@ class MovingHorizon(Law):
             noise_ratio=nan if belief.fit is None else belief.fit.noise / setup.noise_std,
             unexplained=nan if fit is None else fit.unexplained, coasts=belief.coasts,
             unconfirmed=belief.inherited is not None and belief.fit is None,
-            wrong_sign=found is not None and found.m < 0.0,
+            wrong_sign=found is not None and setup.moves_against(found),
             undecided=belief.published is None and found is not None and found.m > 0.0
             and found.left.turns >= settings.HELD_REVERSALS,
             forbidden=outside[0] if outside else None,

@@ -8,10 +8,9 @@ from dataclasses import dataclass, replace
 from math import inf, isnan, sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
 from backlash_ros.core.estimation import settings
-from backlash_ros.core.estimation.fit import FEW_STEPS, FIRST_STEPS, Problem
+from backlash_ros.core.estimation.fit import FIRST_STEPS, Problem
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.posterior import Prior, WindowFit
 from backlash_ros.core.estimation.search import search
@@ -66,6 +65,10 @@ class Setup:
     def moves_unexplained(self, f: WindowFit) -> bool:
         """Whether y moves by more than is tolerated in a way that no G makes, if G is uncertain."""
         return f.systematic and f.unexplained > settings.NEGLIGIBLE and self.family.count > 0
+
+    def moves_against(self, f: WindowFit) -> bool:
+        """Whether y moves against v, by a slope that is possible."""
+        return self.bounds.m[0] <= -f.m <= self.bounds.m[1]
 
     def noisier(self, f: WindowFit) -> bool:
         """Whether readings are off by more than their nominal noise, or their step, makes them."""
@@ -196,19 +199,7 @@ def _with_gap(p: Problem, near: WindowFit, gap: float, weights: Array) -> tuple[
     for share, begun in [((near.p0 - v) / near.gap, False), *ends]:
         f = replace(near, p0=v + share * gap, theta=theta)
         with suppress(np.linalg.LinAlgError):  # so far away that y is no number
-            for _ in range(FEW_STEPS):
+            for _ in range(FIRST_STEPS):
                 f = p.step(f, held=True, begun=begun)
             found.append((p.log_posterior(f, weights), f))
     return max(found, key=lambda one: one[0])
-
-
-def outliers(z: Array) -> NDArray[np.bool_]:
-    """Which normalized residuals (N,) are outliers: few, and not many in a row; nan: lost."""
-    wild, known = np.abs(z) > settings.GATE, np.flatnonzero(np.isfinite(z))
-    if wild.sum() > settings.OUTLIER_SHARE * len(known):
-        return np.zeros_like(wild)
-    rows = np.flatnonzero(np.diff(np.concatenate([[0], wild[known].astype(int), [0]])))
-    for begin, end in zip(rows[::2], rows[1::2], strict=True):
-        if end - begin >= settings.OUTLIERS:
-            wild[known[begin:end]] = False
-    return wild

@@ -19,12 +19,13 @@ import numpy as np
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.estimation import settings
 from backlash_ros.core.estimation.belief import Belief, Known, State, Trial, shortened
-from backlash_ros.core.estimation.explanations import Setup, afresh, mixed, outliers
+from backlash_ros.core.estimation.explanations import Setup, afresh, mixed
 from backlash_ros.core.estimation.fit import FEW_STEPS, Problem
 from backlash_ros.core.estimation.late_commands import likelier, weighed
 from backlash_ros.core.estimation.posterior import Prior, WindowFit, agree
 from backlash_ros.core.estimation.settings import BLOCKS, FEWEST, MISFIT, PREDICTED, SHORT_RECORD
 from backlash_ros.core.estimation.unmodelled import coasts, with_walk
+from backlash_ros.core.records.readings import lone_outliers
 from backlash_ros.core.window import Window
 
 
@@ -123,7 +124,7 @@ def _why(setup: Setup, found: WindowFit | None, record: Window, before: Belief) 
     gap = max(found.gap, setup.guess)
     large = found.unexplained * found.gap > settings.NEGLIGIBLE * gap \
         or record.turns(gap, float(record.v[0])) >= settings.HELD_REVERSALS
-    wrong = found.m < 0.0 or (large and found.systematic and setup.noisier(found))
+    wrong = setup.moves_against(found) or (large and found.systematic and setup.noisier(found))
     return Status.INCONSISTENT if wrong or (known and setup.is_known(found)) else Status.ACQUIRING
 
 
@@ -149,7 +150,7 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
     count, new = len(record.v), before.end - record.first
     problem = setup.problem(record, kept.older)
     fit = problem.fitted(held, FEW_STEPS)
-    wild = outliers(problem.residual(fit)[new:] / held.noise)
+    wild = lone_outliers(problem.residual(fit)[new:] / held.noise)
     if wild.any():
         numbers = frozenset((record.first + new + np.flatnonzero(wild)).tolist())
         cleaned = before._replace(kept=kept._replace(rejected=kept.rejected | numbers))
@@ -202,7 +203,8 @@ def _contradicts(
     all others; rho: correlation of residuals."""
     weights = problem.at(fit).weights
     z = problem.residual(fit) / held.noise
-    if float(np.nanmean(z**2)) > _most(settings.AS_GOOD**2, float(weights.sum()), rho):
+    whole = float(np.nansum(weights * z**2) / weights.sum())
+    if whole > _most(settings.AS_GOOD**2, float(weights.sum()), rho):
         return True
     weights, z = weights[new:], z[new:]
     seen = np.isfinite(z)
@@ -270,7 +272,9 @@ def _published(setup: Setup, belief: Belief, fit: WindowFit) -> Belief:
     if known is not None:
         return _beside_inherited(setup, belief, fit, known)
     if not setup.is_known(fit, settings.REVERSALS if belief.kept.older is not None else None):
-        return belief._replace(reason=Status.INCONSISTENT)
+        # Newer samples may tell that less is known than it seemed: that is no contradiction.
+        wrong = not fit.valid or setup.moves_unexplained(fit) or setup.outside_bounds(fit)
+        return belief._replace(reason=Status.INCONSISTENT if wrong else Status.ACQUIRING)
     if belief.trial.predicted < belief.trial.must:
         return belief
     cov = fit.crossings_cov + np.diag(setup.drift**2 * (belief.end - belief.kept.first) / 3.0)

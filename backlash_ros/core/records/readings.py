@@ -8,7 +8,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.settings import GATE, OUTLIER_SHARE
+from backlash_ros.core.estimation.settings import GATE, OUTLIER_SHARE, OUTLIERS
 from backlash_ros.core.plant.transfer_function import Array
 
 Flags = NDArray[np.bool_]
@@ -161,7 +161,7 @@ def busiest(v: Array, y: Array) -> slice:
     return slice(first, first + SEARCHED_AT_MOST)
 
 
-def outliers(residual: Array, least_std: float) -> NDArray[np.bool_]:
+def outliers(residual: Array, least_std: float) -> Flags:
     """Flags (N,) of what is beyond the bulk of a residual (N,), nan where y is lost; none where
     they are many. least_std: deviation of y that is believed at least."""
     size = np.abs(residual)
@@ -169,6 +169,18 @@ def outliers(residual: Array, least_std: float) -> NDArray[np.bool_]:
     typical = TO_STD * float(np.median(known)) if len(known) else 0.0
     wild = size > GATE * max(typical, least_std)
     return wild if np.count_nonzero(wild) <= OUTLIER_SHARE * len(known) else np.zeros_like(wild)
+
+
+def lone_outliers(z: Array) -> Flags:
+    """Which normalized residuals (N,) are outliers: few, and not many in a row; nan: lost."""
+    wild, known = np.abs(z) > GATE, np.flatnonzero(np.isfinite(z))
+    if wild.sum() > OUTLIER_SHARE * len(known):
+        return np.zeros_like(wild)
+    rows = np.flatnonzero(np.diff(np.concatenate([[0], wild[known].astype(int), [0]])))
+    for begin, end in zip(rows[::2], rows[1::2], strict=True):
+        if end - begin >= OUTLIERS:
+            wild[known[begin:end]] = False
+    return wild
 
 
 def frequencies_of(y: Array) -> tuple[float, float]:
