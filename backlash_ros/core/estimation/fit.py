@@ -227,7 +227,9 @@ class Problem:
             moved = abs(there.gap - f.gap) / max(sqrt(max(new.cov[2, 2], 0.0)), 1e-300)
             f = there if there.step else replace(there, noise_std=self._noise_of(there))
             if value - best < (1.0 if moved < least_move else least_gain):
-                break
+                if most == inf or self.family.count == self.family.leaks:
+                    break
+                far_steps = 0
         return f
 
     def _stepped(

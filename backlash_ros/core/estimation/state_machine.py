@@ -25,7 +25,7 @@ from backlash_ros.core.estimation.late_commands import likelier, weighed
 from backlash_ros.core.estimation.posterior import Prior, WindowFit, agree
 from backlash_ros.core.estimation.settings import BLOCKS, FEWEST, MISFIT, PREDICTED, SHORT_RECORD
 from backlash_ros.core.estimation.unmodelled import coasts, with_walk
-from backlash_ros.core.records.readings import lone_outliers
+from backlash_ros.core.plant.numerics import isolated
 from backlash_ros.core.window import Window
 
 
@@ -150,7 +150,9 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
     count, new = len(record.v), before.end - record.first
     problem = setup.problem(record, kept.older)
     fit = problem.fitted(held, FEW_STEPS)
-    wild = lone_outliers(problem.residual(fit)[new:] / held.noise)
+    z = problem.residual(fit)[new:] / held.noise
+    wild = isolated(np.abs(z) > settings.GATE, np.flatnonzero(np.isfinite(z)),
+                    settings.OUTLIER_SHARE, settings.OUTLIERS)
     if wild.any():
         numbers = frozenset((record.first + new + np.flatnonzero(wild)).tolist())
         cleaned = before._replace(kept=kept._replace(rejected=kept.rejected | numbers))

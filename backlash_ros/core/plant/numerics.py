@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from backlash_ros.core.parameters import ParameterError
 from backlash_ros.core.plant.transfer_function import Array, TransferFunction
@@ -164,6 +164,18 @@ class NoiseLevel:
             del self._sorted[bisect_left(self._sorted, self._sizes[0])]
         self._sizes.append(size)
         insort(self._sorted, size)
+
+
+def isolated(flags: NDArray[np.bool_], known: NDArray[np.intp], most: float, run: int) -> \
+        NDArray[np.bool_]:
+    """Flags (N,) but for runs of so many of the samples that are known (K,); none at all where they
+    are more than a share of these."""
+    out: NDArray[np.bool_] = flags & (flags.sum() <= most * len(known))
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], out[known].astype(int), [0]])))
+    for begin, end in zip(edges[::2], edges[1::2], strict=True):
+        if end - begin >= run:
+            out[known[begin:end]] = False
+    return out
 
 
 def basis(columns: Array) -> Array:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.settings import GATE, OUTLIER_SHARE, OUTLIERS
+from backlash_ros.core.estimation.settings import GATE, OUTLIER_SHARE
 from backlash_ros.core.plant.transfer_function import Array
 
 Flags = NDArray[np.bool_]
@@ -169,18 +169,6 @@ def outliers(residual: Array, least_std: float) -> Flags:
     typical = TO_STD * float(np.median(known)) if len(known) else 0.0
     wild = size > GATE * max(typical, least_std)
     return wild if np.count_nonzero(wild) <= OUTLIER_SHARE * len(known) else np.zeros_like(wild)
-
-
-def lone_outliers(z: Array) -> Flags:
-    """Which normalized residuals (N,) are outliers: few, and not many in a row; nan: lost."""
-    wild, known = np.abs(z) > GATE, np.flatnonzero(np.isfinite(z))
-    if wild.sum() > OUTLIER_SHARE * len(known):
-        return np.zeros_like(wild)
-    rows = np.flatnonzero(np.diff(np.concatenate([[0], wild[known].astype(int), [0]])))
-    for begin, end in zip(rows[::2], rows[1::2], strict=True):
-        if end - begin >= OUTLIERS:
-            wild[known[begin:end]] = False
-    return wild
 
 
 def frequencies_of(y: Array) -> tuple[float, float]:
