@@ -163,7 +163,7 @@ def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]
     r deviations from the best they should be less likely by r^2 / 2; half of that tells another.
     """
     out, beyond = np.zeros((3, 3)), list[WindowFit]()
-    if not best.valid or not best.gap > 0.0 or not best.cov[2, 2] > 0.0:
+    if not (best.valid and best.gap > 0.0 and best.cov[2, 2] > 0.0):
         return out, beyond
     weights, std = p.at(best).weights, sqrt(best.cov[2, 2])
     likeliest, widest = p.log_posterior(best, weights), 2.0 * float(np.ptp(p.v))
@@ -201,5 +201,7 @@ def _with_gap(p: Problem, near: WindowFit, gap: float, weights: Array) -> tuple[
         with suppress(np.linalg.LinAlgError):  # so far away that y is no number
             for _ in range(FIRST_STEPS):
                 f = p.step(f, held=True, begun=begun)
-            found.append((p.log_posterior(f, weights), f))
+                found.append((p.log_posterior(f, weights), f))
+                if abs(found[-1][0] - found[-2][0]) < 0.1:
+                    break
     return max(found, key=lambda one: one[0])

@@ -205,16 +205,14 @@ def _contradicts(
     all others; rho: correlation of residuals."""
     weights = problem.at(fit).weights
     z = problem.residual(fit) / held.noise
-    whole = float(np.nansum(weights * z**2) / weights.sum())
-    if whole > _most(settings.AS_GOOD**2, float(weights.sum()), rho):
+    total = float(weights.sum())
+    if np.nansum(weights * z**2) > total * _most(settings.AS_GOOD**2, total, rho):
         return True
     weights, z = weights[new:], z[new:]
-    seen = np.isfinite(z)
-    count = float(weights[seen].sum())
-    wild = np.abs(z) > settings.GATE
+    count, wild = float(weights.sum()), np.abs(z) > settings.GATE
     mean = float(np.nansum(weights * np.where(wild, 0.0, z**2))) / max(count, 1e-300)
     return mean > _most(MISFIT, count, rho) \
-        or float(wild.sum()) > settings.OUTLIER_SHARE * int(seen.sum())
+        or float(wild.sum()) > settings.OUTLIER_SHARE * np.isfinite(z).sum()
 
 
 def _most(least: float, count: float, rho: float) -> float:
