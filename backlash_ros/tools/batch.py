@@ -6,7 +6,7 @@ import multiprocessing
 import os
 import signal
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import CancelledError, ProcessPoolExecutor
+from concurrent.futures import CancelledError, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from itertools import product
 from math import inf
@@ -107,11 +107,15 @@ def _in_processes(jobs: Sequence[Job], workers: int) -> Iterator[Outcome]:
         with cli.StopRequests() as held:
             # Workers inherit for good what is blocked: a Ctrl-C is for their parent alone.
             signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
-            outcomes = executor.map(run_job, jobs)
+            outcomes = [executor.submit(run_job, job) for job in jobs]
             signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
         if held.count:
             raise KeyboardInterrupt
-        yield from outcomes
+        for outcome in outcomes:
+            # A signal just before a wait, or in another thread, is noticed at the end of the wait.
+            while not wait([outcome], timeout=0.2).done:
+                pass
+            yield outcome.result()
     except BrokenProcessPool:
         raise cli.BrokenOffError('a worker process was killed: is there enough memory?') from None
     finally:
