@@ -179,16 +179,17 @@ def fitted(
     samples: Samples, structure: Structure, *begins: WindowFit, steps: int = STEPS,
     least_gain: float = 0.0,
 ) -> Model:
-    """The values nearest to the one of these that leaves least after two steps."""
-    def after(steps: int, begin: WindowFit) -> Model:
+    """The best of the values nearest to some. least_gain: of the log-likelihood, up to which a step
+    is the last."""
+    found = []
+    for begin in begins:
         problem = samples.problem(structure)
         # As much noise as there is motion hides nothing from the first step.
         fit = replace(begin, step=0.0, noise_std=max(begin.noise_std, 1e-12))
         with suppress(np.linalg.LinAlgError):  # what has no finite posterior stays as it began
             fit = problem.fitted(fit, steps, least_gain)
-        return Model(structure, problem, fit)
-
-    return min(after(steps, one) for one in begins)
+        found.append(Model(structure, problem, fit))
+    return min(found)
 
 
 def steiglitz_mcbride(
