@@ -179,12 +179,16 @@ def _send(stream: IO[bytes], body: bytes) -> None:
 # --- in the worker ------------------------------------------------------------------------------
 
 
+def end_with_parent() -> None:
+    """Let the kernel end this process with the thread that started it, whatever it does then."""
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+
+
 def serve(parent: int, preload: Sequence[str], loops: int) -> None:
     """Compute jobs that come through the standard input, until it or the parent ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)
-    # PR_SET_PDEATHSIG: it ends with the thread that started it, also while a job is computed.
-    ctypes.CDLL(None).prctl(1, signal.SIGKILL)
+    end_with_parent()
     if os.getppid() != parent:
         return  # it has ended before that
     results = os.fdopen(os.dup(1), 'wb')

@@ -1,6 +1,5 @@
 """Many simulated runs: seeds and sweeps as jobs, here or on a cluster, and their statistics."""
 
-import ctypes
 import logging
 import multiprocessing
 import os
@@ -15,6 +14,7 @@ import numpy as np
 import yaml
 from tqdm import tqdm
 
+from backlash_ros.core.jobs import end_with_parent
 from backlash_ros.core.parameters import Parameters, Value
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.run_record import SETTLING_TOLERANCE
@@ -100,7 +100,7 @@ def run_jobs(
 def _in_processes(jobs: Sequence[Job], workers: int) -> Iterator[Outcome]:
     os.environ.update(cli.ONE_THREAD)  # read when a worker imports numpy
     executor = ProcessPoolExecutor(
-        workers, multiprocessing.get_context('spawn'), initializer=_end_with_parent)
+        workers, multiprocessing.get_context('spawn'), initializer=end_with_parent)
     try:
         # A signal that would cut short the start of a worker takes effect afterwards, whichever
         # thread gets it.
@@ -122,10 +122,6 @@ def _in_processes(jobs: Sequence[Job], workers: int) -> Iterator[Outcome]:
         for worker in multiprocessing.active_children():
             worker.kill()  # it has nothing to save
         executor.shutdown(cancel_futures=True)
-
-
-def _end_with_parent() -> None:
-    ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
 
 
 def _on_cluster(jobs: Sequence[Job], address: str) -> Iterator[Outcome]:

@@ -201,7 +201,8 @@ class Problem:
 
     def fitted(self, f: WindowFit, steps: int = STEPS, least_gain: float = 0.0) -> WindowFit:
         """Gauss-Newton steps from f until they move nothing, halved where they go too far."""
-        far_steps = 4  # the first of them, over which G is no further off than configured
+        # The first of them, over which an error of G with a scale is no larger than configured.
+        far_steps = 4 * (self.family.count > self.family.leaks)
         # Deviations of the gap that a step may still move it by; least_gain: of the log-likelihood.
         least_move = 0.02 if steps > FEW_STEPS else 0.2
         for k in range(steps):
@@ -227,7 +228,7 @@ class Problem:
             moved = abs(there.gap - f.gap) / max(sqrt(max(new.cov[2, 2], 0.0)), 1e-300)
             f = there if there.step else replace(there, noise_std=self._noise_of(there))
             if value - best < (1.0 if moved < least_move else least_gain):
-                if most == inf or self.family.count == self.family.leaks:
+                if most == inf:
                     break
                 far_steps = 0
         return f

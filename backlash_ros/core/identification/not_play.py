@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.plant.backlash import play
+from backlash_ros.core.plant.backlash import clamp, play
 from backlash_ros.core.plant.numerics import lfilter
 from backlash_ros.core.plant.transfer_function import Array
 
@@ -196,9 +196,8 @@ def coasting(v: Array, width: float, dry: float, viscous: float) -> Array:
     place, speed, out = float(v[0]), 0.0, []
     for value in v.tolist():
         speed = max(kept * speed - dry, 0.0) if speed > 0.0 else min(kept * speed + dry, 0.0)
-        free, low, high = place + speed, value - half, value + half
-        on = low if free < low else high if free > high else free
-        if on != free:
+        on = clamp(place + speed, value - half, value + half)
+        if on != place + speed:
             speed = on - place
         place = on
         out.append(place)
