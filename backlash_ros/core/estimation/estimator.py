@@ -15,13 +15,14 @@ from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.estimation import settings
 from backlash_ros.core.estimation.belief import Belief, Kept, Known
 from backlash_ros.core.estimation.explanations import Setup
-from backlash_ros.core.estimation.observer import Following, Gain, Place, gains_of, state_after
+from backlash_ros.core.estimation.observer import Following, Place, gains_of, state_after
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.state_machine import learn
 from backlash_ros.core.jobs import Executor, Failure
 from backlash_ros.core.law import Interval, Law, LawReport
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.parameters import Bounds, Parameters
+from backlash_ros.core.plant.numerics import Gain
 from backlash_ros.core.plant.transfer_function import Array, StateModel, TransferFunction
 from backlash_ros.core.window import Recorder, Window
 

@@ -98,26 +98,27 @@ def afresh(
     # The noise of a first step is at least a twentieth of the motion of y.
     noise = max(setup.noise_std, 0.05 * float(np.nanstd(record.y)))
     xi = np.zeros(family.count) if like is None else like.theta[3:]
-    # Where v has not turned often enough for any gap, what is found is named, but not used.
+    # Where v has not turned often enough for any gap, what is found is hardly ever used.
     hopeless = record.turns(0.01 * swing, first) < setup.turns_needed
-    candidates, least = 1 if hopeless else 3, 0.1  # gaps that are fitted, and their distance
-    fits, near = list[WindowFit](), 0.0
-    # Once more around G as the best of the first gaps has it, and closely around that gap.
-    for _ in range(1 if hopeless else 2):
-        found, null = search(family, record.v, record.y, setup.noise_std, setup.widest, xi, near)
+    fits, candidates = list[WindowFit](), 1 if hopeless else 3  # gaps that are fitted
+    for _ in range(1 if hopeless else 2):  # once more around another G, as the best fit has it
+        found, null = search(family, record.v, record.y, setup.noise_std, setup.widest, xi)
         if not found or (not fits and found[0].evidence < null + settings.ENGAGED):
             break
         gaps: list[float] = []
-        for _, gap, p0, m in found:
-            if len(gaps) < candidates and m * found[0].m > 0.0 and \
-                    all(abs(gap - other) > least * other for other in gaps):
+        for evidence, gap, p0, m in found:
+            near = evidence > found[0].evidence - settings.FAR_BEHIND and m * found[0].m > 0.0
+            if near and len(gaps) < candidates and \
+                    all(abs(gap - other) > 0.5 * max(gap, other) for other in gaps):
                 gaps.append(gap)
                 theta = np.concatenate([[m, m * (p0 - first), gap], xi])
                 begin = WindowFit(np.zeros(1), p0, theta, noise, walk_std=setup.walk_std)
                 fits.append(p.finished(p.fitted(
                     p.step(begin, 1.0, held=True, begun=True), FIRST_STEPS)))
         best = max(fits, key=lambda f: f.evidence)
-        xi, near, least = best.theta[3:], best.gap, 0.01
+        if best.valid and best.behind(xi) < 1.0:
+            break
+        xi = best.theta[3:]
     if fits and also is not None and also.m > 0.0:
         begin = replace(also.without_intervals, x=np.zeros(1), knots=np.zeros(0),
                         walk_std=setup.walk_std)
@@ -131,7 +132,7 @@ def afresh(
     likely = different[0].evidence - settings.FAR_BEHIND
     fits = [p.finished(p.fitted(f)) if f.evidence > likely else f for f in different]
     best = max(fits, key=lambda f: f.evidence)
-    if best.m < 0.0 or hopeless:
+    if best.m < 0.0 or not best.left.turns:
         return best
     best = mixed(p, p.with_intervals(best), fits)
     return with_walk(p, best, setup.walk_std) if walks else best
@@ -173,13 +174,14 @@ def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]
             gap = best.gap + reach * std
             if not 0.0 < gap < widest:
                 break
-            value, there = _with_gap(p, there, gap, weights)
+            normal = likeliest - 0.5 * reach**2
+            value, there = _with_gap(p, there, gap, weights, normal, 0.1 * reach**2)
+            if not there.m > 0.0:
+                break
             behind = max(likeliest - value, 1.0)
             if nearer <= 2.0:  # the furthest that is likely may lie well before this one
                 more = max(0.5 / behind - reach**-2, 0.0) * apart(there, best)
                 wider = max(wider, more, key=np.trace)
-            if not there.m > 0.0:
-                break
             beside = there if behind < 0.25 * reach**2 else None
             if nearer and behind > 2.0:
                 break
@@ -190,18 +192,27 @@ def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]
     return out, beyond
 
 
-def _with_gap(p: Problem, near: WindowFit, gap: float, weights: Array) -> tuple[float, WindowFit]:
-    """The log-posterior and the likeliest fit with this gap, from one with a gap near it."""
-    v, found, theta = float(p.v[0]), [(-inf, near)], near.theta.copy()
+def _with_gap(
+    p: Problem, near: WindowFit, gap: float, weights: Array, normal: float, close: float,
+) -> tuple[float, WindowFit]:
+    """The log-posterior and the likeliest fit with this gap, from one with a gap near it.
+
+    normal: what a normal posterior would have; so close to it, after many reversals, no other
+    beginning is tried.
+    """
+    v, best, theta = float(p.v[0]), (-inf, near), near.theta.copy()
     theta[2] = gap
     # The beginning may bar the way to another gap: from both of its ends as well, if it is open.
     ends = [(0.0, True), (1.0, True)] * isnan(p.older.v)
     for share, begun in [((near.p0 - v) / near.gap, False), *ends]:
-        f = replace(near, p0=v + share * gap, theta=theta)
+        f, value = replace(near, p0=v + share * gap, theta=theta), -inf
         with suppress(np.linalg.LinAlgError):  # so far away that y is no number
             for _ in range(FIRST_STEPS):
-                f = p.step(f, held=True, begun=begun)
-                found.append((p.log_posterior(f, weights), f))
-                if abs(found[-1][0] - found[-2][0]) < 0.1:
+                f, before = p.step(f, held=True, begun=begun), value
+                value = p.log_posterior(f, weights)
+                best = max(best, (value, f), key=lambda one: one[0])
+                if abs(value - before) < 0.1:
                     break
-    return max(found, key=lambda one: one[0])
+        if abs(best[0] - normal) < close and near.left.turns >= settings.HELD_REVERSALS:
+            break
+    return best

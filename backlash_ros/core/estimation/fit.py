@@ -28,7 +28,7 @@ STEPS, FIRST_STEPS, FEW_STEPS = 16, 6, 3  # of Gauss-Newton, at most
 class Run(NamedTuple):
     """A record by the values of a fit: G as b / a; p, u, y (N,).
 
-    error: of the readings (N,), 0 where y was lost. weights, begins: as `independence` has them.
+    error: of the readings (N,), 0 where y was lost. weights, number: as `independence` has them.
     """
 
     b: list[float]
@@ -39,7 +39,7 @@ class Run(NamedTuple):
     error: Array
     likelihood: posterior.Likelihood
     weights: Array
-    begins: NDArray[np.intp]
+    number: NDArray[np.intp]
 
 
 class Problem:
@@ -68,10 +68,10 @@ class Problem:
             b, a = self.family.at(f.xi)
             y = lfilter(b, a, u, padded(f.x, len(a) - 1))
             error = (self.y - y) * self.known
-            weights, begins = posterior.independence(self.y, self.known, y, self.step_of_readings)
+            weights, number = posterior.independence(self.y, self.known, y, self.step_of_readings)
             told = posterior.likelihood(error, f.noise_std, f.step, weights)
-            run = Run(b, a, p, u, y, error, told, weights, begins)
-            self._newest = dict([(f, run), *self._newest.items()][:3])
+            run = Run(b, a, p, u, y, error, told, weights, number)
+            self._newest = dict([*self._newest.items(), (f, run)][-3:])
         return self._newest[f]
 
     def residual(self, f: WindowFit) -> Array:
@@ -220,13 +220,13 @@ class Problem:
                         value = of_it
             if not value > best - 50.0:  # f stands: only its posterior is new, and its noise
                 f = replace(f, cov=new.cov, scale=new.scale, volume=new.volume)
-                noise_std = f.noise_std if f.step else self._noise_of(f)
-                if noise_std > 0.9 * f.noise_std:
+                again = f if f.step else self._with_noise(f)
+                if again.noise_std > 0.9 * f.noise_std:
                     return f
-                f = replace(f, noise_std=noise_std)
+                f = again
                 continue
             moved = abs(there.gap - f.gap) / max(sqrt(max(new.cov[2, 2], 0.0)), 1e-300)
-            f = there if there.step else replace(there, noise_std=self._noise_of(there))
+            f = there if there.step else self._with_noise(there)
             if value - best < (1.0 if moved < least_move else least_gain):
                 if most == inf:
                     break
@@ -261,24 +261,28 @@ class Problem:
             new, x=old + length * (x - old), knots=knots + length * (new.knots - knots),
             p0=f.p0 + length * (new.p0 - f.p0), theta=f.theta + length * (new.theta - f.theta))
 
-    def _noise_of(self, f: WindowFit) -> float:
+    def _with_noise(self, f: WindowFit) -> WindowFit:
+        """The same with the noise that its residuals have."""
         run = self.at(f)
         free = max(float(run.weights.sum()) - len(f.x) - len(f.knots) - 4.0, 0.0)
         squares = (run.weights * run.error) @ run.error + self.nominal**2
-        return sqrt(squares / (free + 1.0))
+        out = replace(f, noise_std=sqrt(squares / (free + 1.0)))
+        told = posterior.likelihood(run.error, out.noise_std, 0.0, run.weights)
+        self._newest[out] = run._replace(likelihood=told)
+        return out
 
     def finished(self, f: WindowFit) -> WindowFit:
         """The same with what it leaves."""
         run, known = self.at(f), self.known
-        w, count = run.weights, float(len(run.begins))
+        w, count = run.weights, float(run.weights.sum())
         density, score, information = run.likelihood
-        e = np.add.reduceat((score * w)[known], run.begins)  # of what counts as one reading
+        e = np.bincount(run.number, (score * w)[known])  # of what counts as one reading
         squares = max(float(e @ e), 1e-300)
         rho = max(float(e[lag:] @ e[:-lag]) / squares for lag in (1, 2, 4, 8) if lag < len(e))
         dispersion = squares / max(float(w @ information), 1e-300)  # below 1 rho may be anything
         rho = max(rho - 3.0 / sqrt(max(count, 1.0)), 0.0) * min(dispersion, 1.0)
         # In such units that a reading more or less makes no fit the likelier one.
-        value = float(w @ density) + float(w.sum()) * log(self.step_of_readings or self.nominal)
+        value = float(w @ density) + count * log(self.step_of_readings or self.nominal)
         turns = len(reversals(engaged(self.v, run.p, max(f.gap, 0.0))))
         rms = sqrt(float(run.error @ run.error) / max(int(known.sum()), 1))
         return replace(f, left=posterior.Left(

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from functools import lru_cache, partial
-from math import isnan, nan, sqrt
+from functools import partial
+from math import isnan, nan
 from operator import mul
 from typing import NamedTuple
 
@@ -23,42 +23,11 @@ from backlash_ros.core.estimation.settings import GATE, OUTLIERS, ROWS
 from backlash_ros.core.law import Interval
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.plant.backlash import clamp
-from backlash_ros.core.plant.numerics import lyapunov, riccati
+from backlash_ros.core.plant.numerics import Gain, gain_of
 from backlash_ros.core.plant.transfer_function import Array, StateModel, TransferFunction, powers
 
 # Stationary share of y of the noise on u, in units of the noise of y, that gains are made for.
 RATIOS = tuple(10.0**exponent for exponent in range(-4, 5))
-
-
-class Gain(NamedTuple):
-    """Of the stationary Kalman filter, in units of the noise of y."""
-
-    gain: tuple[float, ...]  # after a prediction, in the observer form
-    innovation: float  # its deviation
-    cov: Array  # of the state in the coordinates of StateModel, (n, n)
-    quiet: float  # `innovation` with this gain, but with the next smaller noise on u
-
-
-@lru_cache(maxsize=64)
-def gain_of(model: StateModel, ratio: float) -> Gain:
-    """Gain for noise on u of this size; 0 where there is none."""
-    n, transfer = model.order, model.transfer_function
-    power = abs(transfer.response(np.array([np.exp(0.1j * np.pi)]))[0])
-    noise = np.outer(model.b, model.b) * (ratio / power) ** 2
-    noise += 1e-9 * float(np.trace(noise)) * np.eye(n)  # keeps the Riccati equation regular
-    c = model.c * np.eye(n)[0]
-    try:
-        p = riccati(model.a.T, c, noise)
-        variance = float(c @ p @ c) + 1.0
-        column = p @ c / variance
-        # Error of the prediction with this gain: P = (A - A k c) P (A - A k c)' + A k k' A' + Q.
-        after = model.a @ column
-        quiet = lyapunov(model.a - np.outer(after, c), np.outer(after, after) + noise * 10.0**-2)
-    except np.linalg.LinAlgError:
-        return Gain((0.0,) * n, 1.0, np.eye(n), 1.0)
-    return Gain(
-        tuple((model.to_observer @ column).tolist()), sqrt(variance),
-        p - np.outer(column, column) * variance, sqrt(float(c @ quiet @ c) + 1.0))
 
 
 def gains_of(model: StateModel) -> tuple[Gain, ...]:

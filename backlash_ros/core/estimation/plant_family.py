@@ -14,7 +14,6 @@ from math import copysign, floor, inf
 from typing import Protocol
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from backlash_ros.core.plant.numerics import lfilter
@@ -59,7 +58,9 @@ class PlantFamily:
         self._pairs, self._nominal = _sections(poles[moving])
         a = [x.real for x in self._stable(self._nominal)]
         self._gain, self._delay = sum(a), len(model.denominator) - len(b)
-        late = max(self._delay + _mean(b) - _mean(np.array(a)), 1.0)
+        # Delay of slow motion in B and in A [samples].
+        of_b, of_a = (float(np.arange(len(x)) @ x) / (sum(x) or inf) for x in (b, a))
+        late = max(self._delay + of_b - of_a, 1.0)
         # Prior deviation and limit of what each xi moves: a leak of up to 0.1 a sample, a lag of 40
         # samples, the width of what acts half a sample late, a factor of 20 on Omega and D.
         self._scales = [
@@ -135,8 +136,10 @@ def padded(x: Array, length: int) -> Array:
 
 def delayed(x: Array, count: int) -> Array:
     """x (..., N) by 0, 1, ... samples later, zeros before it, shape (..., count, N)."""
-    behind = np.concatenate([np.zeros((*x.shape[:-1], count)), x], axis=-1)
-    return sliding_window_view(behind, x.shape[-1], axis=-1)[..., :0:-1, :]
+    out = np.zeros((*x.shape[:-1], count, x.shape[-1]))
+    for late in range(min(count, x.shape[-1])):
+        out[..., late, late:] = x[..., :x.shape[-1] - late]
+    return out
 
 
 def state_columns(a: list[float], count: int) -> Array:
@@ -146,9 +149,9 @@ def state_columns(a: list[float], count: int) -> Array:
 
 def sensitivities(family: Family, xi: list[float], u: Array, y: Array) -> Array:
     """Derivatives of y by each xi, (..., K, N); u, y: input and output over A, (..., N)."""
-    each = [lfilter(b, [1.0], u) - lfilter(a, [1.0], y)
-            for b, a in zip(*map(np.ndarray.tolist, family.slopes(xi)), strict=True)]
-    return np.moveaxis(np.reshape(each, (-1, *u.shape)), 0, -2)
+    of_b, of_a = family.slopes(xi)
+    taps = of_b.shape[1]
+    return np.asarray(of_b @ delayed(u, taps) - of_a @ delayed(y, taps))
 
 
 def _sections(poles: NDArray[np.complex128]) -> tuple[int, list[float]]:
@@ -173,9 +176,3 @@ def _product(*factors: Sequence[complex]) -> list[complex]:
                 out[i + j] += x * y
         product = out
     return product
-
-
-def _mean(taps: Array) -> float:
-    """Delay of slow motion in taps [samples]."""
-    gain = float(taps.sum())
-    return float(np.arange(len(taps)) @ taps) / gain if gain else 0.0

@@ -74,18 +74,23 @@ def _of_interval(r: Array, half: float) -> tuple[Array, Array, Array]:
 def independence(
     y: Array, known: NDArray[np.bool_], output: Array, step: float,
 ) -> tuple[Array, NDArray[np.intp]]:
-    """Share (N,) of an independent reading that each is, and where these begin among the known."""
-    # Equal readings, one after the other, repeat one rounding while the output stands still.
-    same_place = 16  # parts of a step within which an output counts as standing still
+    """Share (N,) of an independent reading that each is, and which one the known are (K,)."""
+    # Readings that are equal wherever the output stands still, or moves as it did before, repeat
+    # one rounding; where they are not, those in a row do.
+    same_place = 16  # parts of a step within which an output counts as the same
     weights = known.astype(np.float64)
-    where = np.flatnonzero(known)
-    if not step or not len(where):
-        return weights, np.arange(len(where))
-    places = np.floor(output[where] * (same_place / step))
-    begins = np.flatnonzero(np.append(True, (np.diff(y[where]) != 0.0) | (np.diff(places) != 0.0)))
-    lengths = np.diff(np.append(begins, len(where)))
-    weights[where] = np.repeat(1.0 / lengths, lengths)
-    return weights, begins
+    if not step or not known.any():
+        return weights, np.arange(int(weights.sum()))
+    read, places = y[known], np.floor(output[known] * (same_place / step))
+    row = np.cumsum(np.append(0, (np.diff(read) != 0.0) | (np.diff(places) != 0.0)))
+    moves = np.diff(places, prepend=places[:1], append=places[-1:])
+    # No two ways have the same sum of irrational multiples.
+    _, first, way = np.unique(places + sqrt(2.0) * moves[:-1] + sqrt(3.0) * moves[1:],
+                              return_index=True, return_inverse=True)
+    differ = np.bincount(way, np.abs(read - read[first[way]])) > 0.5 * step
+    number = np.where(differ[way], row, row[first[way]])
+    weights[known] = 1.0 / np.bincount(number)[number]
+    return weights, number
 
 
 class Prior(NamedTuple):

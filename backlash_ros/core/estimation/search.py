@@ -28,13 +28,12 @@ class Hypothesis(NamedTuple):
 
 def search(
     family: Family, v: Array, y: Array, noise_std: float, widest: float, xi: Array,
-    near: float = 0.0, smallest: float = 0.01,
+    smallest: float = 0.01,
 ) -> tuple[list[Hypothesis], float]:
     """Hypotheses, those likelier than with gaps beside theirs first, and the evidence of no motion.
 
     v, y: (N,), y nan where lost. widest: gap that is considered. xi: error of G (K,), around which
-    G is linearized. near: gap around which more are compared, 0 for none. smallest: gap that is
-    compared, over the largest: the swing of v, or the widest.
+    G is linearized. smallest: gap that is compared, over the largest (swing of v, or the widest).
     """
     known, begins, (b, a) = np.isfinite(y), _bins(v), family.at(xi.tolist())
     readings = np.add.reduceat(known.astype(np.float64), begins)
@@ -94,8 +93,6 @@ def search(
 
     top = min(float(np.ptp(v)), widest)
     gaps: Array = np.append(1e-9 * top, np.geomspace(smallest * top, top, 32))
-    if near > 0.0:
-        gaps = np.unique([*gaps, *np.minimum(np.geomspace(0.8, 1.25, 33) * near, top)])
     # The first is none at all. Of so many at once that memory holds them.
     parts = np.array_split(gaps, 1 + len(gaps) * len(v) * (1 + family.count) // 500_000)
     found = [h for part in parts for h in compared(part) if isfinite(h.evidence)]

@@ -9,13 +9,13 @@ from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR
 
 from backlash_ros.core.estimation.explanations import Setup, afresh
 from backlash_ros.core.estimation.late_commands import weighed
-from backlash_ros.core.estimation.observer import RATIOS, gain_of
+from backlash_ros.core.estimation.observer import RATIOS
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.posterior import independence, likelihood
 from backlash_ros.core.estimation.search import search
 from backlash_ros.core.parameters import Bounds, Parameters
 from backlash_ros.core.plant.backlash import play
-from backlash_ros.core.plant.numerics import lfilter
+from backlash_ros.core.plant.numerics import gain_of, lfilter
 from backlash_ros.core.plant.simulated_plant import altered_plant
 from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
 from backlash_ros.core.window import Window
@@ -77,10 +77,23 @@ def test_density_slope_and_information_belong_together(noise: float, step: float
 
 def test_readings_that_repeat_one_rounding_count_as_one() -> None:
     y, known = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 9.0]), np.arange(6) < 5
-    weights, begins = independence(y, known, np.full(6, 1.2), 1.0)
+    weights, number = independence(y, known, np.full(6, 1.2), 1.0)
     assert weights == pytest.approx([1 / 3] * 3 + [0.5] * 2 + [0.0])
-    assert begins.tolist() == [0, 3]
+    assert number.tolist() == [0, 0, 0, 1, 1]
     assert independence(y, known, 0.1 * np.arange(6), 1.0)[0].tolist() == known.tolist()
+
+
+def test_a_motion_that_is_repeated_repeats_its_rounding_unless_noise_makes_it_differ() -> None:
+    output, known = np.tile([0.1, 1.7, 4.4, 2.2, -1.3, 0.8], 5), np.full(30, True)
+    weights, number = independence(np.round(output), known, output, 1.0)
+    # But for its first and last reading, which do not move as the others.
+    assert 6 <= weights.sum() <= 8
+    assert np.array_equal(number[7:12], number[13:18])
+    rng = np.random.default_rng(3)
+    noisy = np.round(output + rng.standard_normal(30))
+    assert independence(noisy, known, output, 1.0)[0].sum() > 25
+    moved = output + np.repeat(0.1 * np.arange(5), 6)
+    assert independence(np.round(moved), known, moved, 1.0)[0].tolist() == [1.0] * 30
 
 
 def test_a_beginning_between_those_compared_changes_nothing() -> None:
