@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.identification.identification import Details, Identification
-from backlash_ros.core.identification.model import autocorrelation
+from backlash_ros.core.judgement.deviations import autocorrelation
 from backlash_ros.core.plant.backlash import play
 from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.simulation import run_record

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimation import posterior
-from backlash_ros.core.estimation.plant_family import Family, delayed, padded, sensitivities
+from backlash_ros.core.estimation.plant_family import Family, sensitivities
 from backlash_ros.core.estimation.posterior import Prior, WindowFit
 from backlash_ros.core.plant.backlash import Region, engaged, play, reversals
-from backlash_ros.core.plant.numerics import lfilter
+from backlash_ros.core.plant.numerics import lfilter, padded, shifted
 from backlash_ros.core.plant.transfer_function import Array
 
 STEPS, FIRST_STEPS, FEW_STEPS = 16, 6, 3  # of Gauss-Newton, at most
@@ -196,7 +196,7 @@ class Problem:
             f.m * (side == Region.LEFT), run.u, run.y, np.eye(1, count)]))
         *_, u, y, impulse = over_a
         return np.vstack([
-            delayed(impulse, len(run.a) - 1), lfilter(run.b, [1.0], over_a[:-3]),
+            shifted(impulse, len(run.a) - 1), lfilter(run.b, [1.0], over_a[:-3]),
             sensitivities(self.family, f.xi, u, y)]).T
 
     def fitted(self, f: WindowFit, steps: int = STEPS, least_gain: float = 0.0) -> WindowFit:

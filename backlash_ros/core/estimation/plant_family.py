@@ -16,7 +16,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.plant.numerics import lfilter
+from backlash_ros.core.plant.numerics import lfilter, padded, shifted
 from backlash_ros.core.plant.transfer_function import ON_CIRCLE, Array, TransferFunction, memory_of
 
 
@@ -129,29 +129,16 @@ class PlantFamily:
         return np.asarray(powers @ db.T / of_b[:, None] - powers @ da.T / of_a[:, None])
 
 
-def padded(x: Array, length: int) -> Array:
-    """The first values of x, and zeros behind them, (length,)."""
-    return np.append(x, np.zeros(max(length - len(x), 0)))[:length]
-
-
-def delayed(x: Array, count: int) -> Array:
-    """x (..., N) by 0, 1, ... samples later, zeros before it, shape (..., count, N)."""
-    out = np.zeros((*x.shape[:-1], count, x.shape[-1]))
-    for late in range(min(count, x.shape[-1])):
-        out[..., late, late:] = x[..., :x.shape[-1] - late]
-    return out
-
-
 def state_columns(a: list[float], count: int) -> Array:
     """How outputs depend on the state before them, shape (count, order)."""
-    return delayed(lfilter([1.0], a, np.eye(1, count)[0]), len(a) - 1).T
+    return shifted(lfilter([1.0], a, np.eye(1, count)[0]), len(a) - 1).T
 
 
 def sensitivities(family: Family, xi: list[float], u: Array, y: Array) -> Array:
     """Derivatives of y by each xi, (..., K, N); u, y: input and output over A, (..., N)."""
     of_b, of_a = family.slopes(xi)
     taps = of_b.shape[1]
-    return np.asarray(of_b @ delayed(u, taps) - of_a @ delayed(y, taps))
+    return np.asarray(of_b @ shifted(u, taps) - of_a @ shifted(y, taps))
 
 
 def _sections(poles: NDArray[np.complex128]) -> tuple[int, list[float]]:

@@ -16,12 +16,10 @@ from math import log
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.plant_family import delayed
 from backlash_ros.core.identification.identification import Identification
-from backlash_ros.core.identification.model import steiglitz_mcbride
 from backlash_ros.core.parameters import ParameterError
 from backlash_ros.core.plant.actuator import Actuator
-from backlash_ros.core.plant.numerics import lfilter
+from backlash_ros.core.plant.numerics import lfilter, shifted, steiglitz_mcbride
 from backlash_ros.core.plant.transfer_function import Array, TransferFunction
 
 
@@ -40,7 +38,7 @@ def with_actuator(found: Identification, commands: Array) -> Identification:
     place, begin = (details.observed.p - details.v) / gap, details.first - 1 - found.model.delay
     side = np.zeros(len(found.v))
     side[begin:begin + len(place)] = (place < 1e-9) * 1.0 - (place > 1.0 - 1e-9)
-    pushed = (side != 0.0) & (delayed(side, pushed_for + 1) == side).all(axis=0)
+    pushed = (side != 0.0) & (shifted(side, pushed_for + 1) == side).all(axis=0)
     pushed[:pushed_for] = False
     rows = np.flatnonzero(pushed)
     fits = _fits(commands, found.v, side, rows) if len(np.unique(side[rows])) == 2 else ()
@@ -60,13 +58,13 @@ def _fits(
     slowest_motor = 0.99  # pole: a motor that takes longer follows no command
     moved, y = commands - commands[0], v - v[0]
     for order, delay in product((1, 2), range(4)):
-        late, unknowns = delayed(moved, delay + 1)[-1], 2 * order + 3
+        late, unknowns = shifted(moved, delay + 1)[-1], 2 * order + 3
         if len(rows) < 10 * unknowns:
             continue
 
         def follows(a: Array, taps: int = order + 1, late: Array = late) -> Array:
             # A coefficient more than poles is part of a delay.
-            return np.vstack([delayed(lfilter([1.0], a, late), taps), -side, -np.ones(len(v))])
+            return np.vstack([shifted(lfilter([1.0], a, late), taps), -side, -np.ones(len(v))])
 
         for a, weights in steiglitz_mcbride(y, follows, order, rows, steps=12):
             gain = float(weights[:order + 1].sum() / a.sum())

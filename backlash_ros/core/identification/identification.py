@@ -18,9 +18,10 @@ from backlash_ros.core.estimation.fit import FIRST_STEPS
 from backlash_ros.core.identification import model as models
 from backlash_ros.core.identification import structure_search as search
 from backlash_ros.core.identification.model import VAGUE, Model, Structure, Units, fitted
-from backlash_ros.core.identification.not_play import Observed, limited, rate_limit
 from backlash_ros.core.identification.structure_search import Options, Progress, StructureSearch
-from backlash_ros.core.identification.verdict import CERTAIN, Findings, Verdict, judge
+from backlash_ros.core.judgement.deviations import covariance_of, effective
+from backlash_ros.core.judgement.not_play import Observed, limited, rate_limit
+from backlash_ros.core.judgement.verdict import CERTAIN, Findings, Verdict, judge
 from backlash_ros.core.plant.actuator import Actuator
 from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.records import readings
@@ -130,7 +131,7 @@ def identify(
     if not options.delays:
         s = search.later(s, options, progress)
     progress('fitting the whole record')
-    best, samples, rows = s.best, s.samples, models.effective(s.best.left)
+    best, samples, rows = s.best, s.samples, effective(s.best.left)
     # With as many poles, some of them may fit worse.
     best = models.least_response(best, [
         one.whole for one in s.compared if one.whole.behind(best, rows) <= search.PLATEAU
@@ -196,7 +197,7 @@ def _crossings(best: Model, covariance: Array, units: Units) -> tuple[float, lis
 def _described(s: StructureSearch, given: Identification, options: Options) -> Identification:
     """Everything there is to say of the best fit."""
     best, structure, units = s.best, s.best.structure, s.samples.units
-    covariance = models.covariance_of(best.problem, best.fit)
+    covariance = covariance_of(best.problem, best.fit)
     c_r, (gap_var, c_r_var, c_l_var) = _crossings(best, covariance, units)
     g = models.response_of(best, covariance, units.y_size / units.v_size)
     low, high = readings.frequencies_of(best.run.y)
@@ -217,7 +218,7 @@ def _described(s: StructureSearch, given: Identification, options: Options) -> I
         float(np.copysign(np.abs(g.at(middle))[0], static)), gain_std, float(spread.max()),
         # Whatever the correlation: what explains nine tenths of y shows v.
         inf if best.squares < 0.1 * still.squares
-        else 0.5 * still.behind(best, models.effective(best.left)),
+        else 0.5 * still.behind(best, effective(best.left)),
         [(units.v_size * rival, behind) for rival, behind in s.rivals], *_open_delay(s)))
     # What no model explains moves both sides of the gap alike.
     more = 0.25 * (verdict.gap_std**2 - gap_var)
@@ -246,7 +247,7 @@ def _open_delay(s: StructureSearch) -> tuple[int, float]:
         return 0, 0.0
     this, other = (fitted(samples, structure, s.best.begin())
                    for structure in (taken, replace(taken, delay=taken.delay + 1)))
-    if other.behind(this, models.effective(this.left)) >= search.PLATEAU:
+    if other.behind(this, effective(this.left)) >= search.PLATEAU:
         return 0, 0.0
     return taken.delay, samples.units.v_size * abs(other.gap - this.gap)
 

@@ -1,37 +1,32 @@
-"""All plants of one structure, their fit to a record, and what deviations it has.
+"""All plants of one structure, their fit to a record, and how well G is known.
 
     G = z^-(1+delay) B / A,   xi = (B, a) without any prior worth mentioning;   m = 1 is in B
 
 fitted by the Gauss-Newton steps of the loop to a record that is centred and scaled first, so that
-neither an offset nor a unit takes digits. Of residuals that are correlated from sample to sample,
-
-    C = H^-1 (J' R J) H^-1,   H = J'J + what is known beside the samples
-
-with normalised rows J and the Toeplitz matrix R of the residual's autocovariance, tapered to zero
-beyond those lags over which it lasts. No variance is less than that of white noise.
+neither an offset nor a unit takes digits.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import inf, log, nan, sqrt
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial.polynomial import polyval
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.fit import STEPS, Problem
-from backlash_ros.core.estimation.plant_family import delayed, padded, state_columns
+from backlash_ros.core.estimation.plant_family import state_columns
 from backlash_ros.core.estimation.posterior import Prior, WindowFit
+from backlash_ros.core.judgement.deviations import covariance_of, effective
 from backlash_ros.core.plant.backlash import play
-from backlash_ros.core.plant.numerics import lfilter
+from backlash_ros.core.plant.numerics import is_stable, lfilter, padded, shifted, steiglitz_mcbride
 from backlash_ros.core.plant.transfer_function import Array
 
 VAGUE = 1e3  # prior deviation of a coefficient, in scaled units
-TINY = float(np.finfo(float).tiny)
 GRID: Array = np.pi * (np.arange(40) + 0.5) / 40  # frequencies [rad/sample]
 SILENT = 0.1  # relative deviation, or difference, of G beyond which the record is silent
 
@@ -61,7 +56,7 @@ class Structure:
         """B and A of one length; no numbers where a pole lies outside of the unit circle."""
         values = [VAGUE * x for x in xi]
         b, a = values[:self.numerator_taps], [1.0, *values[self.numerator_taps:]]
-        if not _is_stable(a):
+        if not is_stable(a):
             a = [nan] * len(a)
         if self.integrator:
             a = [one - before for one, before in zip([*a, 0.0], [0.0, *a], strict=True)]
@@ -80,16 +75,6 @@ class Structure:
     def xi(self, numerator: Array, a: Array) -> Array:
         """xi of B and the free coefficients of A behind the leading 1; missing taps are 0."""
         return np.append(padded(numerator, self.numerator_taps), a) / VAGUE
-
-
-def _is_stable(a: list[float]) -> bool:
-    """Whether all poles lie within the unit circle, by Schur and Cohn: quicker than its roots."""
-    while len(a) > 1:
-        k = a[-1] / a[0]
-        if not abs(k) < 1.0:
-            return False
-        a = [one - k * other for one, other in zip(a[:-1], a[:0:-1], strict=True)]
-    return True
 
 
 class Units(NamedTuple):
@@ -158,7 +143,7 @@ class Model:
 
     def behind(self, best: Model, rows: float) -> float:
         """Twice the log-likelihood by which it explains less, of so many independent readings."""
-        return rows * log(max(self.squares, TINY) / max(best.squares, TINY))
+        return rows * log(max(self.squares, 1e-300) / max(best.squares, 1e-300))
 
     def begin(self, gap: float | None = None, p0: float | None = None) -> WindowFit:
         """What another fit may begin with: the same, with this gap and beginning, and no state."""
@@ -192,30 +177,6 @@ def fitted(
     return min(found)
 
 
-def steiglitz_mcbride(
-    y: Array, follows: Callable[[Array], Array], poles: int, rows: NDArray[Any], steps: int = 3,
-) -> Iterator[tuple[Array, Array]]:
-    """A with so many poles, and weights (C,) of what A y (N,) follows, from two first filters.
-
-    Least squares over these rows in A and weights, with y and all that it follows filtered by 1/A
-    of the step before. follows: that (C, N), filtered so, by A.
-    """
-    inside = 0.999  # where poles outside of the unit circle are put
-    for pole in (0.6, 0.95) if poles else (0.0,):
-        a: Array = np.atleast_1d(np.poly([pole] * poles))
-        for _ in range(steps if poles else 1):
-            back = lfilter([1.0], a, y)
-            columns = np.vstack([-delayed(back, poles + 1)[1:], follows(a), back])
-            r = np.asarray(np.linalg.qr(columns[:, rows].T, mode='r'))
-            solution = np.linalg.lstsq(r[:, :-1], r[:, -1], rcond=1e-13)[0]
-            a = np.append(1.0, solution[:poles])
-            roots = np.roots(a)
-            size = np.abs(roots)
-            if size.max(initial=0.0) > inside:
-                a = np.real(np.poly(roots * np.minimum(inside / np.maximum(size, inside), 1.0)))
-        yield a, solution[poles:]
-
-
 def first_model(samples: Samples, structure: Structure, gap: float, p0: float) -> Model:
     """The best model by Steiglitz and McBride for a play of this gap and beginning."""
     problem, taps, count = samples.problem(structure), structure.numerator_taps, \
@@ -228,7 +189,7 @@ def first_model(samples: Samples, structure: Structure, gap: float, p0: float) -
         whole = np.asarray(np.convolve(a, (1.0, -1.0))) if structure.integrator else a
         moved, constant = lfilter([1.0], whole, moves)
         of_state = state_columns(padded(whole, structure.states + 1).tolist(), count).T
-        return np.vstack([delayed(moved, taps), constant, of_state])
+        return np.vstack([shifted(moved, taps), constant, of_state])
 
     y, found = np.interp(np.arange(count), np.flatnonzero(known), problem.y[known]), []
     for a, weights in steiglitz_mcbride(y, follows, structure.free_poles, known):
@@ -237,68 +198,6 @@ def first_model(samples: Samples, structure: Structure, gap: float, p0: float) -
         theta = np.concatenate([[1.0, offset, gap], structure.xi(b, a[1:])])
         found.append(Model(structure, problem, WindowFit(weights[taps + 1:], p0, theta, 1.0)))
     return min(found)
-
-
-# --- residuals and deviations ---------------------------------------------------------------------
-
-
-def autocorrelation(residual: Array, lags: int) -> Array:
-    """Of a residual with nan where it is not known, lags 0 to `lags`; 1 first."""
-    known = np.isfinite(residual)
-    spectra = np.fft.rfft([np.where(known, residual, 0.0), known], 2 * len(residual))
-    products, pairs = np.fft.irfft(np.abs(spectra)**2)[:, :lags + 1]
-    covariance = products / np.maximum(np.round(pairs), 1.0)
-    return np.asarray(covariance / covariance[0]) if covariance[0] > 0.0 else np.eye(lags + 1)[0]
-
-
-def covariance_of(problem: Problem, f: WindowFit) -> Array:
-    """Covariance of theta, shape (3 + K, 3 + K)."""
-    columns, count = problem.rows(f)[:, :-1], len(problem.v)
-    run = problem.at(f)
-    _, score, information = run.likelihood
-    residual = np.where(problem.known, score * np.sqrt(run.weights / information), np.nan)
-    columns[:count][~problem.known] = 0.0
-    size = np.sqrt(np.einsum('ij,ij->j', columns, columns))
-    size[size == 0.0] = np.inf  # what no sample depends on
-    q, upper = np.linalg.qr(columns / size)
-    rows = int(problem.known.sum())
-    variance = float(np.nansum(residual**2)) / max(rows - columns.shape[1], 1)
-    # As many as the correlation lasts (D. W. K. Andrews, Econometrica 59 (1991) 817-858).
-    r = lag_one(residual[problem.known])
-    lasts = 1.1447 * (4.0 * r**2 / (1.0 - r**2) ** 2 * rows) ** (1.0 / 3.0)
-    lags = max(round(max(sqrt(rows), min(lasts, 0.25 * rows))), 1)
-    taper = autocorrelation(residual, lags) * (1.0 - np.arange(lags + 1) / (lags + 1.0))
-    of_rows = np.fft.fft(q[:count] * problem.known[:, None], 2 * count, axis=0)
-    spectrum = 2.0 * np.fft.fft(taper, 2 * count).real - taper[0]
-    middle = (of_rows.conj().T @ (spectrum[:, None] * of_rows)).real / (2 * count)
-    values, vectors = np.linalg.eigh(middle)
-    root = np.linalg.pinv(upper, rcond=1e-12) @ vectors \
-        * np.sqrt(variance * np.maximum(values, 1.0)) / size[:, None]
-    matrix, at = root @ root.T, len(root) - len(f.theta)
-    return np.asarray(matrix[at:, at:])
-
-
-def by_model(gap: float, others: Iterable[tuple[float, float]]) -> float:
-    """Deviation of a gap by other models (gap, twice the log-likelihood by which it falls behind):
-    as of a profile likelihood, by the steepest one."""
-    return max((abs(other - gap) / sqrt(max(behind, 1.0))
-                for other, behind in others if behind <= 4.0), default=0.0)
-
-
-def effective(residual: Array) -> float:
-    """How many independent ones residuals (R,) count as; nan counts as none."""
-    r = lag_one(residual)
-    return np.count_nonzero(np.isfinite(residual)) * (1.0 - r) / (1.0 + r)
-
-
-def lag_one(residual: Array, certain: bool = False) -> float:
-    """Correlation of successive residuals (R,) but for nan, at least 0; certain: beyond chance."""
-    residual = residual[np.isfinite(residual)]
-    energy = float(residual @ residual)
-    if energy == 0.0 or not np.isfinite(energy):
-        return 0.0
-    chance = 3.0 / sqrt(len(residual)) if certain else 0.0
-    return min(max(float(residual[1:] @ residual[:-1]) / energy - chance, 0.0), 0.99)
 
 
 class Response(NamedTuple):

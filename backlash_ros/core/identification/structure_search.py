@@ -25,13 +25,12 @@ from backlash_ros.core.identification.model import (
     Samples,
     Structure,
     Units,
-    by_model,
-    effective,
     first_model,
     fitted,
 )
-from backlash_ros.core.identification.not_play import Observed, best_other
-from backlash_ros.core.identification.verdict import ANOTHER
+from backlash_ros.core.judgement.deviations import by_model, effective
+from backlash_ros.core.judgement.not_play import Observed, best_other
+from backlash_ros.core.judgement.verdict import ANOTHER
 from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.records.readings import noise_of, outliers, quantum
 

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from backlash_ros.core.identification import not_play
+from backlash_ros.core.judgement import not_play
 
 Array = NDArray[np.float64]
 

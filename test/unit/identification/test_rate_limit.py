@@ -5,8 +5,8 @@ import pytest
 from scipy.signal import lfilter
 
 from backlash_ros.core.identification.identification import identify
-from backlash_ros.core.identification.not_play import rate_limit
 from backlash_ros.core.identification.structure_search import Options
+from backlash_ros.core.judgement.not_play import rate_limit
 from backlash_ros.core.plant.backlash import play
 from backlash_ros.tools.identify.outcome import identified_parameters
 

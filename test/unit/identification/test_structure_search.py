@@ -12,6 +12,7 @@ from backlash_ros.core.estimation.posterior import WindowFit
 from backlash_ros.core.identification import model as models
 from backlash_ros.core.identification import structure_search as search
 from backlash_ros.core.identification.identification import identify
+from backlash_ros.core.judgement.deviations import by_model, covariance_of
 from backlash_ros.core.plant.backlash import play
 
 SAMPLES = models.Samples(np.zeros(2), np.full(2, np.nan), 1, 2, 0.0)
@@ -95,7 +96,7 @@ def std_of_gap(noise: np.ndarray) -> tuple[float, float]:
     y = lfilter([0.0, 0.3], [1.0, -0.7], play(v, 0.3, 0.1)) + noise
     samples, structure = models.Samples(v, y, 1, len(v), 0.0), models.Structure(1, 0, False)
     found = models.fitted(samples, structure, models.first_model(samples, structure, 0.25, 0.1).fit)
-    matrix = models.covariance_of(found.problem, found.fit)
+    matrix = covariance_of(found.problem, found.fit)
     return matrix[2, 2] ** 0.5, found.fit.cov[2, 2] ** 0.5
 
 
@@ -109,8 +110,8 @@ def test_noise_that_lasts_leaves_a_wider_gap_than_white_noise() -> None:
 
 
 def test_models_that_fit_alike_tell_a_deviation_and_others_none() -> None:
-    assert models.by_model(1.0, [(1.2, -3.0), (1.3, 4.0), (9.0, 4.1)]) == pytest.approx(0.2)
-    assert models.by_model(1.0, []) == 0.0
+    assert by_model(1.0, [(1.2, -3.0), (1.3, 4.0), (9.0, 4.1)]) == pytest.approx(0.2)
+    assert by_model(1.0, []) == 0.0
 
 
 def test_a_fit_that_leaves_more_than_y_itself_is_taken_only_where_all_do() -> None:

@@ -9,7 +9,7 @@ import pytest
 from scipy.signal import lfilter
 from test_not_play import GAP, NOISE, V, behind, dead_zone, observed, play
 
-from backlash_ros.core.identification.verdict import Findings, Verdict, judge
+from backlash_ros.core.judgement.verdict import Findings, Verdict, judge
 
 GOOD = observed(V, behind(play(V, GAP), 'lag'))
 WANDER = 0.0155 * lfilter([1.0], [1.0, -0.95], np.random.default_rng(8).standard_normal(len(V)))

@@ -19,7 +19,7 @@ LAYERS = ('core', 'bags', 'nodes', 'tools')
 ROOMS = (
     'jobs', 'parameters', 'plant', 'window', 'estimate', 'law', 'laws', 'estimation', 'control',
     'scenario', 'assembly', 'loop', 'records', 'simulation', 'record_fit',
-    'identification', 'driver_check',
+    'judgement', 'identification', 'driver_check',
 )
 ESTIMATION = (
     'settings', 'plant_family', 'posterior', 'fit', 'unmodelled', 'search', 'explanations',

@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from backlash_ros.core.identification.model import by_model, effective, lag_one
-from backlash_ros.core.identification.not_play import (
+from backlash_ros.core.judgement.deviations import by_model, effective, lag_one
+from backlash_ros.core.judgement.not_play import (
     Answer,
     LinearFamily,
     Observed,
