@@ -82,13 +82,14 @@ def shortened(
 ) -> tuple[Belief, WindowFit]:
     """Let the oldest samples go, but for what they say of theta, once the others hold enough."""
     count, kept, cut = len(record.v), belief.kept, 0
-    turns = reversals(engaged(record.v, problem.at(fit).p, fit.gap))
     drift = setup.drift**2 * count / 3.0
     if count >= settings.LONGEST or (
             count > 4 * settings.PREDICTED and (drift > np.diag(fit.crossings_cov)).any()):
         cut = count // 3
-    elif count >= settings.ROWS and len(turns) > settings.HELD_REVERSALS:
-        cut = min(count // 3, int(turns[-settings.HELD_REVERSALS]) - 1)
+    elif count >= settings.ROWS:
+        turns = reversals(engaged(record.v, problem.at(fit).p, fit.gap))
+        if len(turns) > settings.HELD_REVERSALS:
+            cut = min(count // 3, int(turns[-settings.HELD_REVERSALS]) - 1)
     if cut < count // 6:
         return belief, fit
     rest = record.between(record.first + cut)
