@@ -1,10 +1,10 @@
-"""What lies between the command and the v that a driver reports: a lag, and wind-up by friction.
+"""Identify the actuator between the command and the reported v: a lag, and wind-up by friction.
 
     v(k) = z L(z) command(k) - w s(k) - offset,   s = 1, -1 while the load is pushed right, left
 
-Dry friction of the load holds the motor back by w while it pushes, and not within the gap; it
-builds up while the contact winds up. So only samples count that come some time after that. s is
-what the backlash that was identified behind v says. All but the poles of L is linear.
+Dry friction of the load holds the motor back by w while it pushes, but not within the gap. This
+builds up after contact, so only samples some time after contact are fitted. The backlash that was
+identified behind v tells s. The model is linear in all but the poles of L.
 """
 
 from collections.abc import Iterator
@@ -24,13 +24,13 @@ from backlash_ros.core.plant.transfer_function import Array, TransferFunction
 
 
 def with_actuator(found: Identification, commands: Array) -> Identification:
-    """The same with what lies between the commands (N,) and the v that were reported, if anything.
+    """The result with the actuator between the commands (N,) and the reported v, if there is one.
 
-    Where no L explains v, a remark says so.
+    If no L explains v, the result gets a remark instead.
     """
-    # gaps (rms) by which v is off the command where nothing lies between, or no L explains it
+    # rms errors, in gaps: below `negligible` v is the command, above `poor` no L explains v
     negligible, poor = 0.01, 0.1
-    pushed_for = 10  # samples after which the load is pushed on a side as hard as it ever is
+    pushed_for = 10  # samples in contact after which the wind-up is complete
     details, gap = found.details, found.gap
     off = float(np.sqrt(np.mean((found.v - commands)**2)))
     if details is None or off <= negligible * gap:
@@ -54,8 +54,8 @@ def with_actuator(found: Identification, commands: Array) -> Identification:
 def _fits(
     commands: Array, v: Array, side: Array, rows: NDArray[np.intp],
 ) -> Iterator[tuple[float, float, Actuator]]:
-    """Criterion (BIC), rms of what is left over, and the actuator, for orders and delays."""
-    slowest_motor = 0.99  # pole: a motor that takes longer follows no command
+    """Yield (BIC, rms of the residual, actuator) for each order and delay that can be fitted."""
+    slowest_motor = 0.99  # pole; a motor that is slower does not follow the command
     moved, y = commands - commands[0], v - v[0]
     for order, delay in product((1, 2), range(4)):
         late, unknowns = shifted(moved, delay + 1)[-1], 2 * order + 3
@@ -63,7 +63,7 @@ def _fits(
             continue
 
         def follows(a: Array, taps: int = order + 1, late: Array = late) -> Array:
-            # A coefficient more than poles is part of a delay.
+            # One coefficient more than poles allows for a fraction of a sample of delay.
             return np.vstack([shifted(lfilter([1.0], a, late), taps), -side, -np.ones(len(v))])
 
         for a, weights in steiglitz_mcbride(y, follows, order, rows, steps=12):
@@ -75,7 +75,7 @@ def _fits(
             wind_up, offset = weights[order + 1:].tolist()
             offset += gain * float(commands[0]) - float(v[0])
             with suppress(ParameterError):
-                # v at the end of an interval belongs to the next sample: one more pole at 0.
+                # v is reported at the end of its interval, a sample later: one more pole at 0.
                 lag = TransferFunction(weights[:order + 1].tolist(),
                                        [*a.tolist(), *[0.0] * (delay + 1)], 'actuator')
                 yield len(rows) * log(squares) + unknowns * log(len(rows)), \

@@ -1,9 +1,9 @@
-"""From v and y to backlash, G(z), delay and noise, with deviations and all that keeps them apart.
+"""Identify backlash, G(z), delay and noise from v and y, with standard deviations and a verdict.
 
     the best structure (structure_search.py)  ->  a fit of the whole record
-    ->  deviations, verdict (verdict.py), all in units of the record
+    ->  standard deviations and verdict (verdict.py), all in units of the record
 
-Search and fit are those of the loop, for plants without a prior (model.py).
+Search and fit are those of the loop, for plants with a vague prior (model.py).
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from backlash_ros.core.records import readings
 
 
 class Details(NamedTuple):
-    """What pictures show, in units of the record. first: number of the first y that was fitted; v:
-    as it acts on each y from there on."""
+    """What figures show, in units of the record. first: index of the first y that was fitted; v:
+    the v that acts on each y from there on."""
 
     first: int
     v: Array
@@ -39,9 +39,9 @@ class Details(NamedTuple):
 
 
 class FoundModel(NamedTuple):
-    """y = z^-delay numerator / denominator u, for the m that was told. delays: that explain y
-    equally well. response_std: relative deviation of G at `frequencies` [rad/sample], between which
-    y moves. uncertainty: as plant.uncertainty. noise_std, quantum: of y, its step 0 for none."""
+    """y = z^-delay numerator / denominator u, for the given m. delays: all that explain y equally
+    well. response_std: relative std of G at `frequencies` [rad/sample], which span the motion of y.
+    uncertainty: for plant.uncertainty. quantum: step of y, or 0. outliers: readings left out."""
 
     numerator: tuple[float, ...] = ()
     denominator: tuple[float, ...] = ()
@@ -58,9 +58,9 @@ class FoundModel(NamedTuple):
 
 @dataclass(frozen=True)
 class Identification:
-    """What was found. std: deviations of gap, c_r, c_l and, for m, of the product of m and the gain
-    of G. refused: why nothing was fitted, or why a controller does not take it. verdict, details:
-    None where nothing was fitted. actuator: between the command and v, where one is known."""
+    """The result. std: standard deviations of gap, c_r, c_l and, as m, of m times the gain of G.
+    refused: why nothing was fitted, or why a controller rejects the result. verdict, details: None
+    if nothing was fitted. actuator: between the command and v, if one was identified."""
 
     sample_period: float
     v: Array
@@ -81,21 +81,21 @@ class Identification:
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Why it is of no use to a controller, a sentence each."""
+        """Why a controller cannot use the result, a sentence each; empty if it can."""
         return (self.refused,) if self.refused else self.verdict.reasons if self.verdict else ()
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What to know, a sentence each."""
+        """What else to know about the result, a sentence each."""
         return self.verdict.remarks if self.verdict else ()
 
     @property
     def hertz(self) -> Array:
-        """Frequencies at which the deviation of G is told."""
+        """Frequencies [Hz] at which the standard deviation of G is given."""
         return np.asarray(self.model.frequencies / (2.0 * np.pi * self.sample_period))
 
     def with_remarks(self, *remarks: str) -> Identification:
-        """The same with these remarks, where something was fitted."""
+        """The result with these remarks instead of its own, if anything was fitted."""
         return replace(self, verdict=self.verdict and self.verdict._replace(remarks=remarks))
 
     @property
@@ -107,10 +107,10 @@ def identify(
     v: Array, y: Array, sample_period: float, options: Options | None = None,
     progress: Progress = lambda _: None,
 ) -> Identification:
-    """Identify v (N,), applied from k to k+1, and y (N,) at k, nan where lost.
+    """Identify the plant from v (N,), applied from k to k+1, and y (N,) at k, nan where lost.
 
-    progress: is told what is being done. Raises ValueError for arrays that do not fit together or
-    hold what is no number.
+    progress: called with the name of each step as it begins. Raises ValueError for arrays of
+    different lengths, a v that is not finite or a y that is infinite.
     """
     options = options or Options()
     v, y = np.asarray(v, dtype=float), np.asarray(y, dtype=float)
@@ -132,7 +132,7 @@ def identify(
         s = search.later(s, options, progress)
     progress('fitting the whole record')
     best, samples, rows = s.best, s.samples, effective(s.best.left)
-    # With as many poles, some of them may fit worse.
+    # Rivals differ in the delay alone and fit about as well.
     best = models.least_response(best, [
         one.whole for one in s.compared if one.whole.behind(best, rows) <= search.PLATEAU
         and one.structure != best.structure == replace(
@@ -144,7 +144,7 @@ def identify(
         samples = replace(samples, v=v, y=whole, last=len(v))
         begin = best.begin(p0=float(v[0]) + 0.5 * best.gap)
         best = fitted(samples, best.structure, begin, steps=FIRST_STEPS)
-    # What the first model could not explain may be no outlier by the best one.
+    # A reading that was an outlier to the first model need not be one to the best.
     kept = search.without_outliers(replace(samples, y=y), best)
     if not np.array_equal(kept.y, samples.y, equal_nan=True):
         samples = kept
@@ -161,9 +161,9 @@ def identify(
 
 
 def _why_nothing(v: Array, y: Array, options: Options) -> str:
-    """Why there is nothing to fit; empty where there is. y: of the part that is searched."""
+    """Why nothing can be fitted, or ''. y: over the stretch that is searched."""
     known = np.isfinite(y[max(options.delays or search.EARLY) + 1:])
-    # The first samples of them are fitted alone, to predict the others.
+    # The first samples are fitted alone and have to predict the others.
     first = known[:len(known) - round(search.HELD_OUT * len(known))]
     needed = 8 * max(Structure(order, 0, False).unknowns
                      for order in (max(options.orders), search.GENERAL_POLES))
@@ -181,10 +181,10 @@ def _why_nothing(v: Array, y: Array, options: Options) -> str:
 
 
 def _crossings(best: Model, covariance: Array, units: Units) -> tuple[float, list[float]]:
-    """c_r, and the variances of gap, c_r and c_l."""
+    """c_r and the variances of gap, c_r and c_l, in units of the record."""
     taps = best.structure.numerator_taps
     b, a = float(best.numerator.sum()), 1.0 + float(best.a.sum())
-    # Unless G integrates, the middle of y is part of the offset.
+    # Unless G integrates, centring y has changed the offset.
     shift = 0.0 if best.structure.integrator or not b else units.y / units.y_size * a / b
     of_gap, of_c_r = np.zeros((2, len(covariance)))
     of_gap[2] = of_c_r[1] = 1.0
@@ -195,7 +195,7 @@ def _crossings(best: Model, covariance: Array, units: Units) -> tuple[float, lis
 
 
 def _described(s: StructureSearch, given: Identification, options: Options) -> Identification:
-    """Everything there is to say of the best fit."""
+    """The result for the best fit: estimates, standard deviations, model and verdict."""
     best, structure, units = s.best, s.best.structure, s.samples.units
     covariance = covariance_of(best.problem, best.fit)
     c_r, (gap_var, c_r_var, c_l_var) = _crossings(best, covariance, units)
@@ -208,21 +208,21 @@ def _described(s: StructureSearch, given: Identification, options: Options) -> I
     delays = tuple(sorted({*search.equal_delays(s.compared, s.chosen), structure.delay}))
     observed, total = search.observed_of(s.samples, best), float(g.numerator.sum())
     static = total if structure.integrator else total / float(g.denominator.sum())
-    # Where no structure explains all, likelihoods say little: as likely are all that predict as
-    # well. A single one does not spoil the median of their distances.
+    # If no structure explains y, likelihoods say little: all that predict about as well count
+    # alike, and the median of their distances withstands a single odd one.
     alike = search.predictors(s.compared) if observed.unexplained else []
     apart = max(s.apart, readings.TO_STD * float(np.median(
         [abs(one.whole.gap - best.gap) for one in alike] or [0.0])))
     verdict = judge(Findings(
         observed, sqrt(gap_var), units.v_size * apart, sqrt(c_r_var),
         float(np.copysign(np.abs(g.at(middle))[0], static)), gain_std, float(spread.max()),
-        # Whatever the correlation: what explains nine tenths of y shows v.
+        # Whatever the correlation, a fit that explains nine tenths of y shows that v acts.
         inf if best.squares < 0.1 * still.squares
         else 0.5 * still.behind(best, effective(best.left)),
         [(units.v_size * rival, behind) for rival, behind in s.rivals], *_open_delay(s)))
-    # What no model explains moves both sides of the gap alike.
+    # Each crossing takes half of what the verdict adds to the deviation of the gap.
     more = 0.25 * (verdict.gap_std**2 - gap_var)
-    # As parameters have it: z where G is a gain, for B acts a sample late.
+    # As in the parameters: a gain gets a pole at 0, since B acts one sample late.
     at_zero = structure.numerator_taps - structure.order
     return replace(
         given, m=options.slope, gap=units.v_size * best.gap, c_r=c_r, verdict=verdict,
@@ -240,8 +240,8 @@ def _described(s: StructureSearch, given: Identification, options: Options) -> I
 
 
 def _open_delay(s: StructureSearch) -> tuple[int, float]:
-    """The delay, if it is the longest that was compared and one more sample fits as well, else 0;
-    and by how much that moves the gap [v]."""
+    """The delay and the change of the gap [v] with one sample more, if the delay is the longest
+    that was compared and one sample more fits as well; else zeros."""
     samples, taken = replace(s.samples, first=s.samples.first + 1), s.best.structure
     if not 0 < taken.delay == max(s.delays):
         return 0, 0.0
@@ -253,7 +253,7 @@ def _open_delay(s: StructureSearch) -> tuple[int, float]:
 
 
 def _still(best: Model) -> Model:
-    """A u that stands still, through the same G."""
+    """The same G, driven by a u that stands still."""
     problem, theta = best.problem, best.fit.theta.copy()
     theta[2] = 2.0 * float(np.ptp(problem.v))
     still = replace(best.fit, p0=float(problem.v.max()), theta=theta)
@@ -261,14 +261,14 @@ def _still(best: Model) -> Model:
 
 
 def _as_a_gain(found: Identification, s: StructureSearch, options: Options) -> Identification:
-    """With a G that is a gain and a delay, where a better one is not known but the gap is: a slow
-    log of a position servo tells no more; what moves y otherwise counts as an error of G."""
+    """Take a gain and a delay for G if the gap is known but no better G is, as in a slow log of a
+    position servo. Whatever else moves y then counts as an error of G."""
     gains = [one for one in s.compared if one.structure.order == 0]
     if not gains or not _known(found, False):
         return found
     chosen, v_size = min(gains, key=lambda one: one.whole.squares), s.samples.units.v_size
     best = fitted(s.samples, chosen.structure, chosen.trained.fit)
-    # What depends on the model.
+    # A gap that depends on the model is less certain.
     apart = s.apart + 0.5 * abs(best.gap - found.gap / v_size)
     gain = _described(s._replace(chosen=chosen, best=best, apart=apart), found, options)
     if not _known(gain, True) or apart * v_size >= CERTAIN * found.std['gap']:
@@ -279,13 +279,13 @@ def _as_a_gain(found: Identification, s: StructureSearch, options: Options) -> I
 
 
 def _known(found: Identification, model: bool) -> bool:
-    """Whether the backlash is known, and G is or is not."""
+    """Whether the backlash is known and G is known, or not known, as `model` says."""
     return found.verdict is not None and found.verdict.backlash.known \
         and found.verdict.model.known == model
 
 
 def _as_parameter(spread: float) -> float:
-    """plant.uncertainty for a relative spread of G: one digit, upwards, and 1 % at least."""
+    """plant.uncertainty for a relative spread of G: rounded up to one digit, from 0.01 to 1."""
     value = min(max(spread, 0.01), 1.0)
     digit = 10.0 ** np.floor(np.log10(value))
     return float(min(round(np.ceil(value / digit - 1e-9) * digit, 6), 1.0))

@@ -1,9 +1,9 @@
-"""All plants of one structure, their fit to a record, and how well G is known.
+"""Models of one structure, their fit to a record, and how well the record determines G.
 
-    G = z^-(1+delay) B / A,   xi = (B, a) without any prior worth mentioning;   m = 1 is in B
+    G = z^-(1+delay) B / A,   xi = (B, a) with a vague prior;   m is held at 1, B has the gain
 
-fitted by the Gauss-Newton steps of the loop to a record that is centred and scaled first, so that
-neither an offset nor a unit takes digits.
+The Gauss-Newton steps of the loop fit them to a record that is centred and scaled first, so that
+neither offsets nor units cost precision.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from backlash_ros.core.plant.backlash import play
 from backlash_ros.core.plant.numerics import is_stable, lfilter, padded, shifted, steiglitz_mcbride
 from backlash_ros.core.plant.transfer_function import Array
 
-VAGUE = 1e3  # prior deviation of a coefficient, in scaled units
+VAGUE = 1e3  # prior standard deviation of a coefficient, in scaled units
 GRID: Array = np.pi * (np.arange(40) + 0.5) / 40  # frequencies [rad/sample]
-SILENT = 0.1  # relative deviation, or difference, of G beyond which the record is silent
+SILENT = 0.1  # relative std of G, or difference of two models, beyond which G is unknown
 
 
 @dataclass(unsafe_hash=True)
 class Structure:
-    """A family of plants: number of poles, of which one may be an integrator; samples of v before
-    it acts, less one; coefficients of B, where 0 as many as poles, one of G that is a gain.
+    """A family of plants. order: poles, of which one is at 1 if `integrator`. delay: samples from v
+    to y, less one. taps: coefficients of B; 0 for as many as poles, but at least one.
 
-    states: numbers of the state before a record. unknowns: numbers that are fitted, with the gap,
-    the start, the offset and the state. leaks: all of count have priors of their own.
+    count: coefficients of G to fit. states: size of the state before a record. unknowns: all that
+    is fitted, with gap, start, offset and state. leaks: as in Family; no prior has a scale here.
     """
 
     order: int
@@ -53,7 +53,7 @@ class Structure:
         self.unknowns = self.count + self.states + 3
 
     def at(self, xi: list[float]) -> tuple[list[float], list[float]]:
-        """B and A of one length; no numbers where a pole lies outside of the unit circle."""
+        """B and A, padded to one length; A is nan if a free pole lies outside the unit circle."""
         values = [VAGUE * x for x in xi]
         b, a = values[:self.numerator_taps], [1.0, *values[self.numerator_taps:]]
         if not is_stable(a):
@@ -63,7 +63,7 @@ class Structure:
         return b + [0.0] * (self.states + 1 - len(b)), a + [0.0] * (self.states + 1 - len(a))
 
     def slopes(self, _: list[float]) -> tuple[Array, Array]:
-        """Derivatives of B and A by each of xi, the same everywhere."""
+        """Derivatives of B and A with respect to each of xi, the same for every xi."""
         taps, poles = self.numerator_taps, self.free_poles
         of_b, of_a = np.zeros((2, self.count, self.states + 1))
         of_b[:taps, :taps] = VAGUE * np.eye(taps)
@@ -73,12 +73,12 @@ class Structure:
         return of_b, of_a
 
     def xi(self, numerator: Array, a: Array) -> Array:
-        """xi of B and the free coefficients of A behind the leading 1; missing taps are 0."""
+        """xi from B, padded with zeros, and the free coefficients of A after the leading 1."""
         return np.append(padded(numerator, self.numerator_taps), a) / VAGUE
 
 
 class Units(NamedTuple):
-    """Middle and size of v and of y, by which both are centred and scaled."""
+    """Offset and scale of v and of y, by which a record is centred and scaled."""
 
     v: float
     v_size: float
@@ -86,13 +86,13 @@ class Units(NamedTuple):
     y_size: float
 
 
-ALREADY = Units(0.0, 1.0, 0.0, 1.0)  # of signals that are centred and scaled
+ALREADY = Units(0.0, 1.0, 0.0, 1.0)  # for signals that are centred and scaled already
 
 
 @dataclass(frozen=True)
 class Samples:
-    """A record (N,), centred and scaled, y nan where lost; [first, last): the y that are fitted.
-    step: of the readings where rounding is most of what a fit leaves, so that repeated ones repeat
+    """A record (N,), centred and scaled, y nan where lost; y is fitted over [first, last).
+    step: quantization step of y if rounding dominates the residual, so that equal readings share
     one error; else 0."""
 
     v: Array
@@ -107,7 +107,7 @@ class Samples:
         return self.y[self.first:self.last]
 
     def problem(self, structure: Structure) -> Problem:
-        held = 1e6  # weight of m = 1, which is in B
+        held = 1e6  # weight that holds m at 1: the gain is in B
         begin, y = self.first - 1 - structure.delay, self.fitted_y
         prior = Prior(held * np.eye(1, 3 + structure.count), np.full(1, held))
         return Problem(structure, self.v[begin:begin + len(y)], y, 1e-12, prior, step=self.step)
@@ -115,11 +115,11 @@ class Samples:
 
 @dataclass(eq=False)
 class Model:
-    """A structure with the values that fit best, in scaled units; less is what leaves less.
+    """A structure and its fit, in scaled units; of two models the one with less squares is less.
 
-    numerator: B. denominator: A, with the integrator; a: its free coefficients behind the leading
-    1. run: y, and the play output as it acts on it, at every sample. left: the residual where y is
-    known (R,), its squares, inf where they are no number, and rms.
+    numerator: B. denominator: A with the integrator; a: its free coefficients after the leading 1.
+    run: simulated y, and the play output that acts on it, at every sample. left: the residual where
+    y is known (R,); squares: the sum of its squares, inf if that is not finite; rms: its rms.
     """
 
     structure: Structure
@@ -142,18 +142,18 @@ class Model:
         return self.squares < other.squares
 
     def behind(self, best: Model, rows: float) -> float:
-        """Twice the log-likelihood by which it explains less, of so many independent readings."""
+        """Twice the log-likelihood by which it is behind `best`, of `rows` independent readings."""
         return rows * log(max(self.squares, 1e-300) / max(best.squares, 1e-300))
 
     def begin(self, gap: float | None = None, p0: float | None = None) -> WindowFit:
-        """What another fit may begin with: the same, with this gap and beginning, and no state."""
+        """Initial values for another fit: these, with the gap and p0 if given, and a zero state."""
         theta = self.fit.theta.copy()
         theta[2] = self.gap if gap is None else gap
         return WindowFit(
             np.zeros(1), self.fit.p0 if p0 is None else p0, theta, self.fit.noise_std)
 
     def begin_with_pole(self, pole: float, structure: Structure) -> WindowFit:
-        """The same for the structure with a pole more, which a zero cancels."""
+        """Initial values for `structure`, one order higher: a zero cancels the additional pole."""
         b, a = (np.asarray(np.convolve(one, (1.0, -pole)), dtype=float)
                 for one in (self.numerator, np.append(1.0, self.a)))
         return replace(self.begin(), theta=np.append(
@@ -164,28 +164,28 @@ def fitted(
     samples: Samples, structure: Structure, *begins: WindowFit, steps: int = STEPS,
     least_gain: float = 0.0,
 ) -> Model:
-    """The best of the values nearest to some. least_gain: of the log-likelihood, up to which a step
-    is the last."""
+    """The best of the fits from these initial values. least_gain: a step that raises the
+    log-likelihood by less is the last."""
     found = []
     for begin in begins:
         problem = samples.problem(structure)
-        # As much noise as there is motion hides nothing from the first step.
+        # Readings are values here, not intervals, and never without noise.
         fit = replace(begin, step=0.0, noise_std=max(begin.noise_std, 1e-12))
-        with suppress(np.linalg.LinAlgError):  # what has no finite posterior stays as it began
+        with suppress(np.linalg.LinAlgError):  # without a finite posterior it stays as it began
             fit = problem.fitted(fit, steps, least_gain)
         found.append(Model(structure, problem, fit))
     return min(found)
 
 
 def first_model(samples: Samples, structure: Structure, gap: float, p0: float) -> Model:
-    """The best model by Steiglitz and McBride for a play of this gap and beginning."""
+    """The best model by Steiglitz-McBride iteration, for a play of this gap that begins at p0."""
     problem, taps, count = samples.problem(structure), structure.numerator_taps, \
         len(samples.fitted_y)
     known = problem.known
     moves = np.vstack([play(problem.v, gap, p0), np.ones(count)])
 
     def follows(a: Array) -> Array:
-        # A y over A: with an integrator in both, 1 - 1/z cancels.
+        # Only the free poles multiply y; an integrator divides all that y follows.
         whole = np.asarray(np.convolve(a, (1.0, -1.0))) if structure.integrator else a
         moved, constant = lfilter([1.0], whole, moves)
         of_state = state_columns(padded(whole, structure.states + 1).tolist(), count).T
@@ -201,8 +201,8 @@ def first_model(samples: Samples, structure: Structure, gap: float, p0: float) -
 
 
 class Response(NamedTuple):
-    """m G without its delay; covariance: of B and a. denominator: 1, a; times 1 - 1/z where G is
-    an integrator."""
+    """Frequency response of m G without its delay. denominator: 1 and a, to be multiplied by
+    1 - 1/z if `integrator`. covariance: of B and a."""
 
     numerator: Array
     denominator: Array
@@ -210,16 +210,16 @@ class Response(NamedTuple):
     covariance: Array
 
     def at(self, frequencies: Array) -> NDArray[np.complex128]:
-        """At frequencies [rad/sample]."""
+        """Complex response at frequencies [rad/sample]."""
         back = np.exp(-1j * np.asarray(frequencies))
         value = back * polyval(back, self.numerator) / polyval(back, self.denominator)
         return np.asarray(value / (1.0 - back) if self.integrator else value)
 
     def std(self, frequencies: Array) -> Array:
-        """Relative deviation at frequencies [rad/sample], shape (N,)."""
+        """Relative standard deviation at frequencies [rad/sample], shape (N,)."""
         back = np.exp(-1j * np.asarray(frequencies, dtype=float))
         free, top = polyval(back, self.denominator), polyval(back, self.numerator)
-        # d log(mG): z^-i / B for b_i, -z^-j / A for a_j.
+        # Derivatives of log(m G): z^-i / B with respect to b_i, -z^-j / A to a_j.
         jacobian = np.array([
             *(back**i / top for i in range(len(self.numerator))),
             *(-back**j / free for j in range(1, len(self.denominator)))]).T
@@ -228,13 +228,13 @@ class Response(NamedTuple):
 
     @property
     def known_up_to(self) -> float:
-        """Frequency [rad/sample] from which on G is not known; pi where it is throughout."""
+        """Highest frequency of GRID [rad/sample] at which G is known; the lowest if at none."""
         known = np.flatnonzero(self.std(GRID) <= SILENT)
         return float(GRID[known[-1]]) if len(known) else float(GRID[0])
 
 
 def response_of(found: Model, covariance: Array | None = None, unit: float = 1.0) -> Response:
-    """Of a model, with the covariance of its theta; unit: of y over that of v."""
+    """Response of a model with this covariance of theta. unit: scale of y over that of v."""
     if covariance is None:
         covariance = np.zeros((3 + found.structure.count,) * 2)
     scale = np.append(np.full(found.structure.numerator_taps, unit * VAGUE),
@@ -244,15 +244,15 @@ def response_of(found: Model, covariance: Array | None = None, unit: float = 1.0
 
 
 def least_response(best: Model, rivals: Sequence[Model] = ()) -> Model:
-    """The model to take, of those with other delays that fit alike.
+    """Choose between the best model and rivals that fit as well with another delay.
 
-    High frequencies that v hardly had leave zeros and delay of G open, and a fast controller would
-    act on whatever noise puts there. Within two standard deviations of each fit, the model is taken
-    whose |G|^2 is least where G is not known, or where those delays contradict each other: sampled
-    plants that are driven through a hold have little gain there.
+    If v has little power at high frequencies, noise determines zeros and delay of G there, and a
+    fast controller would act on it. So of all models within two standard deviations of each fit,
+    take the one with the least |G|^2 where G is unknown, or else where the delays disagree: sampled
+    plants behind a hold have little gain there.
     """
     if best.structure.numerator_taps < 2:
-        return best  # a gain is the same at every frequency
+        return best  # |B| is the same at every frequency
     own = response_of(best, covariance_of(best.problem, best.fit))
     silent = own.known_up_to < GRID
     if not silent.any():
@@ -269,9 +269,9 @@ def least_response(best: Model, rivals: Sequence[Model] = ()) -> Model:
 
 
 def _smoothed(found: Model, silent: Array, noise_variance: float) -> Model:
-    """With the heaviest weight on these gains that stays within two deviations."""
+    """With the heaviest penalty on |G| at `silent` that stays within two standard deviations."""
     covariance, taps = covariance_of(found.problem, found.fit), found.structure.numerator_taps
-    # Their product with B is G at these frequencies, real and imaginary parts.
+    # Times B they are G at these frequencies but for its phase, real and imaginary parts.
     back = np.exp(-1j * silent)
     of_b = back[:, None] ** np.arange(taps) / np.abs(polyval(back, found.denominator))[:, None]
     rows = np.zeros((2 * len(silent), len(covariance)))
@@ -279,7 +279,7 @@ def _smoothed(found: Model, silent: Array, noise_variance: float) -> Model:
     pull = covariance @ rows.T @ rows
     for weight in 1e6 / max(float(np.trace(pull)), 1e-300) * 0.0625 ** np.arange(12.0):
         theta = np.linalg.solve(np.eye(len(pull)) + weight * pull, found.fit.theta)
-        theta[2] = theta[2] if theta[2] > 0.0 else found.gap  # a line knows no end of the gaps
+        theta[2] = theta[2] if theta[2] > 0.0 else found.gap  # linear steps may leave the range
         fit = replace(found.fit, theta=theta)
         if not np.isfinite(found.structure.at(fit.xi)[1]).all():
             continue  # a pole has left the unit circle

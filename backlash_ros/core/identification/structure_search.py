@@ -1,12 +1,12 @@
-"""Which order, delay and integrator G has: a search of the gap, and a race of structures.
+"""Choose the order and delay of G, and whether it integrates, by comparing structures.
 
-    the gap with a general G  ->  orders, delays, integrators on held-out samples
-    ->  the gap again with the one that is taken  ->  later delays, where these fit as well
+    search the gap with a general G  ->  compare orders, delays, integrators on held-out samples
+    ->  search the gap again with the chosen one  ->  try later delays if the latest fits as well
 
 A structure with a pole that a zero cancels gives way to the same one without that pole. Structures
-whose held-out error is within a few percent of the least, or within its own deviation, are equally
-good predictors; of these the least N' log(squares) + unknowns log(N') over all samples is taken
-(BIC), with N' = N (1 - r) / (1 + r) for the lag-1 correlation r of the residual.
+whose held-out error is within 5 % or one standard deviation of the least predict equally well; the
+one with the least BIC over all samples, N' log(squares) + unknowns log(N'), is chosen from them,
+with N' = N (1 - r) / (1 + r) for the lag-1 correlation r of the residual.
 """
 
 from collections.abc import Callable, Sequence
@@ -35,19 +35,19 @@ from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.records.readings import noise_of, outliers, quantum
 
 Progress = Callable[[str], object]
-EARLY, LONGEST_DELAY = (0, 1, 2, 3), 40  # delays that are compared first, and the longest
-GENERAL_POLES = 3  # of the G with which the gap is searched first; it has a tap for each delay
-HELD_OUT = 1.0 / 3.0  # share of the record, its last
-ALIKE = 0.1  # of the log-likelihood, by which no structure is better than another
-HOPELESS = 1.5  # squares over the least, beyond which a fit is not completed
+EARLY, LONGEST_DELAY = (0, 1, 2, 3), 40  # delays that are compared first, and the longest of all
+GENERAL_POLES = 3  # of the G for the first search of the gap; it has a tap for each delay
+HELD_OUT = 1.0 / 3.0  # share of the record that is held out, at its end
+ALIKE = 0.1  # gain of the log-likelihood that is not worth another step
+HOPELESS = 1.5  # ratio of squares to the least beyond which a fit is abandoned
 PLATEAU = 10.0  # difference of the criterion below which two delays are equally good
-EXACT = 1e-10  # rms over that of y, less than which no error counts: simulations round
+EXACT = 1e-10  # rms error, over the rms of y, below which all is rounding
 
 
 @dataclass(frozen=True)
 class Options:
-    """What is compared. delays [samples]: none for EARLY, and later ones where these fit better.
-    integrators: whether G has one. slope: m, which cannot be told from the gain of G."""
+    """What to compare. delays [samples]: if empty, EARLY and then later ones while they fit better.
+    integrators: whether G has one. slope: the given m, inseparable from the gain of G."""
 
     orders: Sequence[int] = (0, 1, 2, 3, 4)
     delays: Sequence[int] = ()
@@ -56,9 +56,9 @@ class Options:
 
 
 class Compared(NamedTuple):
-    """One structure. trained: fitted to the first part, held_out: its rms error on the last part;
-    scatter: relative deviation of that. whole: fitted to all samples. criterion: the smaller the
-    better."""
+    """A structure and its fits. trained: to the first part; held_out: its rms error on the last
+    part; scatter: relative standard deviation of that. whole: fit to all samples. criterion: its
+    BIC, the smaller the better."""
 
     structure: Structure
     held_out: float
@@ -69,8 +69,8 @@ class Compared(NamedTuple):
 
 
 class HeldOut(NamedTuple):
-    """Prediction of samples (M,) that were not fitted, from `first` on; rms of its error, and of
-    the fit to the samples before; all in units of the record."""
+    """Prediction of the samples (M,) held out, from index `first` on. rms: of its error; trained:
+    rms error of the fit to the samples before. All in units of the record."""
 
     first: int
     measured: Array
@@ -80,8 +80,8 @@ class HeldOut(NamedTuple):
 
 
 class StructureSearch(NamedTuple):
-    """The best of the structures that were compared, in scaled units. rivals: other minima (gap,
-    how far behind). apart: deviation of the gap by models or delays that fit alike."""
+    """The best of the structures compared, in scaled units. rivals: other minima, as (gap, loss of
+    log-likelihood). apart: standard deviation of the gap over models or delays that fit alike."""
 
     samples: Samples
     compared: list[Compared]
@@ -96,12 +96,12 @@ class StructureSearch(NamedTuple):
 def searched(
     v: Array, y: Array, units: Units, options: Options, delays: Sequence[int], progress: Progress,
 ) -> StructureSearch:
-    """The best structure with one of these delays, of v and y (N,) that are centred and scaled."""
+    """Find the best structure with one of these delays for v and y (N,), centred and scaled."""
     progress('searching the gap')
     samples = Samples(v, y, max(delays) + 1, len(v), step_of(y), units)
     found = _with_general(samples, delays)
     kept = without_outliers(samples, found[0])
-    # Where rounding is the least of what is left, readings are no intervals.
+    # If the residual exceeds the quantization step, rounding does not dominate it.
     kept = replace(kept, step=samples.step * (found[0].rms <= samples.step))
     if kept.y is not samples.y or kept.step != samples.step:
         samples = kept
@@ -120,7 +120,7 @@ def searched(
         best = models[0]
         if not gives_way(best, _eligible(compared)):
             break
-        # Only the best fit of all shows that a pole is none.
+        # Only the best fit of a structure shows that a zero cancels a pole.
         compared = [one._replace(whole=best) if one is chosen else one for one in compared]
     rows = effective(best.left)
     rivals = [(one.gap, 0.5 * one.behind(best, rows)) for one in models
@@ -136,7 +136,7 @@ def searched(
 
 
 def _with_general(samples: Samples, delays: Sequence[int]) -> list[Model]:
-    """Models of different gaps, the best first, with a few poles and a tap for each delay."""
+    """Models of different gaps with a general G, the best first."""
     general = Structure(
         GENERAL_POLES, min(delays), False, GENERAL_POLES + max(delays) - min(delays))
     swing = float(np.ptp(samples.v))
@@ -144,16 +144,16 @@ def _with_general(samples: Samples, delays: Sequence[int]) -> list[Model]:
                     for gap in (0.0, 0.05 * swing, 0.2 * swing, 0.5 * swing))
     best = fitted(samples, general, *(one.fit for one in begins[:2]), steps=FEW_STEPS)
     models = _of_gaps(samples, best)
-    # Around another G the search may find another gap.
+    # Linearised around the better G, the search may find another gap.
     if models[0].squares < 0.9 * best.squares and abs(models[0].gap - best.gap) > 0.1 * best.gap:
         models = _of_gaps(samples, models[0])
     return models
 
 
 def _of_gaps(samples: Samples, like: Model) -> list[Model]:
-    """Fits of the same structure to the minima over the gap, the best first."""
-    most, apart = 4, 0.005  # minima that are fitted, and the relative distance of different ones
-    smallest = 2e-3  # gap that is searched for, over the swing of v
+    """Fits of the structure of `like` from each local minimum over the gap, the best first."""
+    most, apart = 4, 0.005  # minima that are fitted; relative distance of gaps that differ
+    smallest = 2e-3  # least gap that is searched for, over the swing of v
     structure, problem = like.structure, like.problem
     y = np.where(problem.known, problem.y, nan)
     hypotheses, _ = search(structure, problem.v, y, 1e-12, 0.98 * float(np.ptp(problem.v)),
@@ -174,7 +174,7 @@ def _of_gaps(samples: Samples, like: Model) -> list[Model]:
 
 
 def without_outliers(samples: Samples, found: Model) -> Samples:
-    """The same without readings that are none, by more than rounding: far off, or repeated."""
+    """The samples without outliers, and without readings repeated once although the model moves."""
     y, simulated = samples.fitted_y, found.run.y
     step = quantum(y)
     same = np.append(False, np.diff(y) == 0.0)
@@ -191,8 +191,8 @@ def without_outliers(samples: Samples, found: Model) -> Samples:
 def _compare(
     samples: Samples, candidates: Sequence[Model], structures: Sequence[Structure], cut: int,
 ) -> list[Compared]:
-    """Fit the structures to the samples before `cut` and to all of them, from models whose gap and
-    beginning are about right, and from those with a pole less."""
+    """Fit each structure to the samples before `cut` and to all of them, beginning with the gap and
+    p0 of the candidates, which are about right, and with the fit of one pole less."""
     train, later = replace(samples, last=cut), replace(samples, first=cut)
     found: dict[Structure, tuple[Model, Model]] = {}
     for structure in sorted(structures, key=lambda s: s.order):
@@ -219,7 +219,7 @@ def _compare(
 
 
 def predictors(compared: Sequence[Compared]) -> list[Compared]:
-    """The structures that predict about as well as any."""
+    """The structures that predict the held-out samples about as well as the best of them."""
     eligible = _eligible(compared)
     needed = [one for one in eligible if not gives_way(one.whole, eligible)]
     least = min(needed, key=lambda one: one.held_out)
@@ -228,12 +228,12 @@ def predictors(compared: Sequence[Compared]) -> list[Compared]:
 
 
 def selected(compared: Sequence[Compared]) -> Compared:
-    """The structure that is taken."""
+    """The structure to choose: of the good predictors, the one with the least criterion."""
     return min(predictors(compared), key=lambda one: one.criterion)
 
 
 def _eligible(compared: Sequence[Compared]) -> list[Compared]:
-    """Structures without those that are no model, if there are others."""
+    """Leave out structures that explain nothing or ring, unless all of them do."""
     found = list(compared)
     for useless in (_explains_nothing, _rings):
         found = [one for one in found if not useless(one.whole)] or found
@@ -241,30 +241,30 @@ def _eligible(compared: Sequence[Compared]) -> list[Compared]:
 
 
 def _explains_nothing(found: Model) -> bool:
-    """Whether it leaves more than there is of y, however well its last part is predicted anew."""
+    """Whether the residual exceeds y, though the last part, begun anew, may be predicted well."""
     return found.squares > float(np.sum(found.problem.y**2))
 
 
 def _rings(found: Model) -> bool:
-    """Whether an oscillation hardly dies out over the record: it explains what G does not."""
-    lasting = 4.0  # time constants that a record has to be long
+    """Whether it has an oscillation that hardly decays over the record, which is no part of G."""
+    lasting = 4.0  # least length of the record, in time constants of the oscillation
     poles = np.roots(np.append(1.0, found.a))
     return bool(np.any((poles.imag != 0.0) & (abs(poles) > 1.0 - lasting / len(found.problem.v))))
 
 
 def gives_way(found: Model, compared: Sequence[Compared]) -> bool:
-    """Whether a zero cancels a pole, and the structure without that pole is compared as well."""
+    """Whether a zero cancels a pole and the structure without that pole was compared as well."""
     s = found.structure
     smaller = [Structure(s.order - 1, s.delay, s.integrator and pole != 1.0)
                for pole in cancelled_poles(found)]
-    # One that explains far less has been fitted badly.
+    # A smaller structure that explains far less was fitted badly.
     return any(one.structure in smaller and one.whole.squares <= 2.0 * found.squares
                for one in compared)
 
 
-@lru_cache(64)  # of the structures that are compared
+@lru_cache(64)  # about one for each structure compared
 def cancelled_poles(found: Model) -> list[complex]:
-    """Poles that a zero all but cancels, so that neither shows; an integrator as exactly 1."""
+    """Poles that a zero all but cancels; the pole of an integrator is exactly 1."""
     if not np.isfinite(found.numerator).all():
         return []
     zeros = np.roots(found.numerator)
@@ -275,8 +275,8 @@ def cancelled_poles(found: Model) -> list[complex]:
 
 
 def equal_delays(compared: Sequence[Compared], chosen: Compared) -> list[int]:
-    """Delays that explain y as well as the chosen one, with as many poles or more, for a lag that
-    a pole of its own would make may stand for a delay."""
+    """Delays that explain y as well as the chosen one, with at least as many poles: the lag of an
+    additional pole may stand in for part of a delay."""
     taken = chosen.structure
     return sorted({
         one.structure.delay for one in compared
@@ -285,19 +285,19 @@ def equal_delays(compared: Sequence[Compared], chosen: Compared) -> list[int]:
 
 
 def _predicted(found: Model, later: Samples) -> Array:
-    """Simulation over samples (M,), begun in the state and with the offset that fit them best."""
+    """Simulated y (M,) over later samples, from the initial state and offset that fit them best."""
     begin = replace(found.fit, x=np.zeros(1), p0=float(found.run.p[-1]))
     problem = later.problem(found.structure)
     return problem.at(problem.begun(begin, True)).y
 
 
 def later(early: StructureSearch, options: Options, progress: Progress) -> StructureSearch:
-    """The search among later delays, as long as the latest one explains y as well as any."""
+    """Extend the search to later delays while the latest explains y as well as the chosen one."""
     latest = min(LONGEST_DELAY, len(early.samples.v) // 20)
     while (last := max(early.delays)) < latest and last in equal_delays(
             early.compared, early.chosen):
-        # What is no play, any delay explains a little better; what y does beside v is told by a
-        # residual, in which too short a delay shows as well.
+        # If it is no play, every later delay fits a little better. Tests of the residual are left
+        # out here: they would take too short a delay for something that moves y besides v.
         o = observed_of(samples := early.samples, early.best)
         if o.unexplained and best_other(o):
             break
@@ -317,7 +317,7 @@ def later(early: StructureSearch, options: Options, progress: Progress) -> Struc
 
 
 def _likeliest_delay(samples: Samples, like: Model, delays: range) -> int:
-    """That of these with which the same structure leaves least."""
+    """The delay with which the structure of `like` leaves the smallest residual."""
     samples, begin, squares = replace(samples, first=delays[-1] + 1), like.begin(), []
     for delay in delays:
         found = fitted(samples, replace(like.structure, delay=delay), begin, steps=FEW_STEPS)
@@ -327,7 +327,7 @@ def _likeliest_delay(samples: Samples, like: Model, delays: range) -> int:
 
 
 def observed_of(samples: Samples, best: Model) -> Observed:
-    """The signals of a fit in units of the record; v at the same samples as y."""
+    """The signals of a fit in units of the record, with v at the samples of y, not delayed."""
     v0, v_size, y0, y_size = samples.units
     known, y = best.problem.known, samples.fitted_y
     noise = max(noise_of(np.flatnonzero(known).astype(float), y[known]), quantum(y) / sqrt(12.0))
