@@ -156,8 +156,8 @@ def identify(
     progress('judging')
     found = _as_a_gain(_described(s, given, options), s, options)
     return found if slow is None else found.with_remarks(
-        f'v jumps, and the drive follows by at most {slow / sample_period:.4g} per s: the fit is '
-        'to v limited so, as is control.rate_max in the file', *found.remarks)
+        f'v jumps, and the drive follows at {slow / sample_period:.4g} per s at most: the fit is '
+        'to v with this limit, which is control.rate_max in the file', *found.remarks)
 
 
 def _why_nothing(v: Array, y: Array, options: Options) -> str:

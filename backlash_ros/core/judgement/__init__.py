@@ -1,1 +1,1 @@
-"""What the fit of a record tells, how surely, and what else it may be."""
+"""Judgement of a fit: what it tells, how certain that is, and what else may explain the record."""

@@ -1,11 +1,11 @@
-"""How far a fit may be off: by residuals that are correlated, and by other models that fit alike.
+"""Standard deviations of a fit, for correlated residuals and for other models that fit as well.
 
-Of residuals that are correlated from sample to sample, the covariance of a fit is
+If residuals are correlated from sample to sample, the covariance of a fit is
 
-    C = H^-1 (J' R J) H^-1,   H = J'J + what is known beside the samples
+    C = H^-1 (J' R J) H^-1,   H = J'J + prior information
 
 with normalised rows J and the Toeplitz matrix R of the residual's autocovariance, tapered to zero
-beyond those lags over which it lasts. No variance is less than that of white noise.
+over the lags for which it lasts. No variance is less than that for white noise.
 """
 
 from collections.abc import Iterable
@@ -19,7 +19,7 @@ from backlash_ros.core.plant.transfer_function import Array
 
 
 def autocorrelation(residual: Array, lags: int) -> Array:
-    """Of a residual with nan where it is not known, lags 0 to `lags`; 1 first."""
+    """Autocorrelation at lags 0 to `lags` of a residual (N,), nan where it is unknown."""
     known = np.isfinite(residual)
     spectra = np.fft.rfft([np.where(known, residual, 0.0), known], 2 * len(residual))
     products, pairs = np.fft.irfft(np.abs(spectra)**2)[:, :lags + 1]
@@ -28,18 +28,18 @@ def autocorrelation(residual: Array, lags: int) -> Array:
 
 
 def covariance_of(problem: Problem, f: WindowFit) -> Array:
-    """Covariance of theta, shape (3 + K, 3 + K)."""
+    """Covariance of theta, shape (3 + K, 3 + K), that allows for correlated residuals."""
     columns, count = problem.rows(f)[:, :-1], len(problem.v)
     run = problem.at(f)
     _, score, information = run.likelihood
     residual = np.where(problem.known, score * np.sqrt(run.weights / information), np.nan)
     columns[:count][~problem.known] = 0.0
     size = np.sqrt(np.einsum('ij,ij->j', columns, columns))
-    size[size == 0.0] = np.inf  # what no sample depends on
+    size[size == 0.0] = np.inf  # of unknowns on which no sample depends
     q, upper = np.linalg.qr(columns / size)
     rows = int(problem.known.sum())
     variance = float(np.nansum(residual**2)) / max(rows - columns.shape[1], 1)
-    # As many as the correlation lasts (D. W. K. Andrews, Econometrica 59 (1991) 817-858).
+    # Lags over which the correlation lasts (D. W. K. Andrews, Econometrica 59 (1991) 817-858).
     r = lag_one(residual[problem.known])
     lasts = 1.1447 * (4.0 * r**2 / (1.0 - r**2) ** 2 * rows) ** (1.0 / 3.0)
     lags = max(round(max(sqrt(rows), min(lasts, 0.25 * rows))), 1)
@@ -55,20 +55,20 @@ def covariance_of(problem: Problem, f: WindowFit) -> Array:
 
 
 def by_model(gap: float, others: Iterable[tuple[float, float]]) -> float:
-    """Deviation of a gap by other models (gap, twice the log-likelihood by which it falls behind):
-    as of a profile likelihood, by the steepest one."""
+    """Standard deviation of a gap from other models, as (gap, twice their loss of log-likelihood):
+    the largest that a parabolic profile likelihood through one of them has, 0 if none is near."""
     return max((abs(other - gap) / sqrt(max(behind, 1.0))
                 for other, behind in others if behind <= 4.0), default=0.0)
 
 
 def effective(residual: Array) -> float:
-    """How many independent ones residuals (R,) count as; nan counts as none."""
+    """Number of independent residuals that the residuals (R,) are worth; nan is left out."""
     r = lag_one(residual)
     return np.count_nonzero(np.isfinite(residual)) * (1.0 - r) / (1.0 + r)
 
 
 def lag_one(residual: Array, certain: bool = False) -> float:
-    """Correlation of successive residuals (R,) but for nan, at least 0; certain: beyond chance."""
+    """Lag-1 correlation of residuals (R,) without nan, at least 0; certain: less what is chance."""
     residual = residual[np.isfinite(residual)]
     energy = float(residual @ residual)
     if energy == 0.0 or not np.isfinite(energy):

@@ -1,8 +1,8 @@
-"""What is not a play, or not that alone, named by what it is.
+"""Recognise and name what is not a play, or not a play alone.
 
-Another nonlinearity takes the place of the play before all that is linear, which is solved for
-exactly: what is compared depends on no G that was fitted with a play. What moves y beside v is told
-by the residual of the fit. Tests return a sentence, empty where they find nothing.
+Another nonlinearity replaces the play in front of a family of linear systems, which is solved for
+exactly: the comparison depends on no G that was fitted with a play. What moves y besides v shows in
+the residual of the fit. Tests return a sentence, or '' if they find nothing.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,7 +21,7 @@ At = tuple[float, ...]  # parameters of a nonlinearity
 
 
 class Answer(NamedTuple):
-    """Whether something is known; what, or why not; and what to do about it."""
+    """Whether something is known; what is known, or why it is not; and the cure."""
 
     known: bool
     reason: str
@@ -33,7 +33,7 @@ class Answer(NamedTuple):
 
 
 class Candidate(NamedTuple):
-    """Squares that a nonlinearity leaves, its parameters, and what it has y follow."""
+    """Sum of squares that a nonlinearity leaves, its parameters, and the regressors of y."""
 
     squares: float
     at: At
@@ -41,8 +41,8 @@ class Candidate(NamedTuple):
 
 
 class LinearFamily:
-    """All that is linear between the output of a nonlinearity (N,) and y (N,), nan where lost.
-    v: scaled to 0 to 1, as are the parameters of nonlinearities. rows: samples that are compared.
+    """Linear systems from the output of a nonlinearity (N,) to y (N,), nan where lost. v: scaled to
+    the range 0 to 1, as are the parameters of nonlinearities. rows: samples that are compared.
     """
 
     def __init__(self, v: Array, y: Array) -> None:
@@ -57,7 +57,7 @@ class LinearFamily:
             np.ones(len(v)), np.linspace(-1.0, 1.0, len(v)), bend**2, bend**3])[self.rows]
 
     def columns(self, w: Array) -> Array:
-        """Three taps, lags and, last, the integral of w (N,)."""
+        """Regressors of y: three taps, several lags and, last, the integral of w (N,)."""
         w = w - w.mean()
         steps = np.diff(w, prepend=[w[0], w[0]])
         found = [w, steps[1:], np.diff(steps)]
@@ -67,7 +67,7 @@ class LinearFamily:
         return np.column_stack([*found, np.cumsum(w)])[self.rows]
 
     def solved(self, columns: Array, part: slice = slice(None)) -> tuple[float, Array]:
-        """Squares left over of a part of the rows, and the solution for columns and `common`."""
+        """Solve a part of the rows: the sum of squares left, weights of columns and `common`."""
         whole, target = np.column_stack([columns, self.common])[part], self.target[part]
         scale = np.sqrt(np.einsum('ij,ij->j', whole, whole))
         scale[scale == 0.0] = 1.0
@@ -79,8 +79,8 @@ class LinearFamily:
     def best(
         self, nonlinearity: Callable[..., Array], starts: Sequence[At], evaluations: int = 50,
     ) -> Candidate:
-        """The best parameters of a nonlinearity of v, from the best two starts."""
-        from scipy.optimize import minimize  # a fifth of the time that a start takes
+        """Fit the parameters of a nonlinearity of v, beginning with the best two starts."""
+        from scipy.optimize import minimize  # here, as it takes a fifth of the start-up time
 
         def left(at: Sequence[float]) -> float:
             w = nonlinearity(self.v, *at)
@@ -95,8 +95,8 @@ class LinearFamily:
         return Candidate(squares, at, self.columns(nonlinearity(self.v, *at)))
 
     def changing(self, gap: float, basis: Array) -> tuple[Array, Candidate]:
-        """Gaps [v] of a basis (B, N) that make up the width of a play, by Gauss-Newton steps from
-        a constant gap."""
+        """Fit a play whose width is a sum of basis functions (B, N) by Gauss-Newton steps from a
+        constant gap. Returns their coefficients [v] (B,) and the fit."""
         widths: Array = np.full(len(basis), max(gap / self.swing, 1e-4))
         best = widths, Candidate(np.inf, (), np.empty(0))
         for _ in range(8):
@@ -118,14 +118,14 @@ class LinearFamily:
         return self.swing * np.maximum(best[0], 0.0), best[1]
 
     def share(self, other: Candidate, one: Candidate, noise: float) -> float:
-        """Of what `one` leaves beyond the noise, what `other` explains; 0 where that is chance."""
+        """Share of what `one` leaves beyond the noise that `other` explains; 0 if it is chance."""
         beyond = max(one.squares - noise**2 * len(self.rows), 1e-300)
-        # Neighbours of smooth residuals tell little of their own.
+        # White residuals have a factor of 0.5: smooth ones tell less, as neighbours are alike.
         gain = 0.2 * len(self.rows) * np.log(one.squares / max(other.squares, 1e-300))
         return (one.squares - other.squares) / beyond if gain >= 15.0 else 0.0
 
     def beats(self, other: Candidate, one: Candidate, noise: float) -> bool:
-        """Whether `other` explains next to all, and much in both halves of the record."""
+        """Whether `other` explains nearly all of it, and half of it in each half of the record."""
         explained, half = 0.95, len(self.rows) // 2
         return self.share(other, one, noise) >= explained and all(
             self.solved(other.columns, part)[0]
@@ -135,9 +135,9 @@ class LinearFamily:
 
 @dataclass
 class Observed:
-    """A record and its fit, N samples each. y: nan where lost. p: play output [v], as it acts on y.
-    noise: standard deviation of white noise and rounding of y. gap: that of p. unexplained: whether
-    the residual is more than noise. family: some of the record, to compare nonlinearities by."""
+    """A record and its fit, N samples each. y: nan where lost. p: play output [v] that acts on y.
+    noise: standard deviation of white noise and rounding of y. gap: of that play. unexplained:
+    whether the residual exceeds noise. family: compares nonlinearities, over the first samples."""
 
     v: Array
     y: Array
@@ -157,41 +157,41 @@ class Observed:
 
     @cached_property
     def one_play(self) -> Candidate:
-        """The best play."""
+        """The best single play."""
         widths = (6e-4, 3e-3, 0.01, 0.03, 0.1, 0.2, 0.4, 0.6, 0.8, self.gap / self.family.swing)
         return self.family.best(centred, [(width,) for width in widths])
 
     @cached_property
     def plays(self) -> Candidate:
-        """The best many plays in parallel."""
+        """The best set of many plays in parallel."""
         return self.best(_many, PARALLEL)
 
     def share(self, other: Candidate) -> float:
-        """Of what no G with a play explains, noise aside, what `other` does, at most 1."""
-        # The family holds not every G: no play explains less than the fit does.
+        """Share of what the best play with any G leaves, beyond noise, that `other` explains."""
+        # The family lacks some G: the best play explains no less than the fit does.
         left = float(np.sum(self.residual[self.family.rows]**2))
         one = self.one_play._replace(squares=min(left, self.one_play.squares))
         return min(self.family.share(other, one, self.noise), 1.0)
 
     def best(self, nonlinearity: Callable[..., Array], starts: Sequence[At]) -> Candidate:
-        """The best of this nonlinearity from these starts, which is looked for once."""
+        """Fit a nonlinearity from these starts; a second call returns the first result."""
         if nonlinearity not in self._candidates:
             self._candidates[nonlinearity] = self.family.best(nonlinearity, starts)
         return self._candidates[nonlinearity]
 
 
-# --- nonlinearities of v (N,), scaled to 0 to 1, and what is said of them -------------------------
+# --- nonlinearities of v (N,), which is scaled to 0 to 1 ------------------------------------------
 
 
 def centred(v: Array, width: float) -> Array:
-    """Play about its middle."""
+    """Output of a play whose gap is centred on it."""
     width = abs(width)
     return play(v, width, float(v[0]) + 0.5 * width) - 0.5 * width
 
 
 def coasting(v: Array, width: float, dry: float, viscous: float) -> Array:
-    """Play with a load that runs on from the side that it leaves, braked by dry friction and by a
-    share of its speed each sample."""
+    """Play with a load that runs on when it leaves a side; in each sample its speed [v/sample]
+    falls by `dry` and by the share `viscous`."""
     half, dry, kept = 0.5 * abs(width), abs(dry), 1.0 - min(abs(viscous), 1.0)
     place, speed, out = float(v[0]), 0.0, []
     for value in v.tolist():
@@ -205,7 +205,7 @@ def coasting(v: Array, width: float, dry: float, viscous: float) -> Array:
 
 
 def limited(v: Array, step: float) -> Array:
-    """v (N,), followed with steps of at most so much."""
+    """What follows v (N,) by at most `step` per sample."""
     step, place, out = abs(step), float(v[0]), []
     for value in v.tolist():
         place += min(max(value - place, -step), step)
@@ -214,9 +214,9 @@ def limited(v: Array, step: float) -> Array:
 
 
 def rate_limit(v: Array, y: Array) -> float | None:
-    """Largest step of v (N,) that a drive followed, as y (N,) shows: v jumps, and what reaches the
-    play follows as a ramp. None where a play explains y without it, or v never jumps."""
-    jump = 0.05  # step of v that a drive may be too slow for [swing of v]
+    """Largest step per sample of a drive that turns jumps of v (N,) into ramps, as y (N,) shows.
+    Returns None if a play explains y without such a limit, or if v never jumps."""
+    jump = 0.05  # least step of v that may be too fast for the drive [swing of v]
     family = LinearFamily(v, y)
     largest = float(np.max(np.abs(np.diff(family.v)), initial=0.0))
     if largest < jump or not family.enough:
@@ -228,16 +228,16 @@ def rate_limit(v: Array, y: Array) -> float | None:
     play_alone = family.best(centred, [(width,) for width in (6e-4, 0.01, 0.1, 0.3)])
     slow = family.best(following, [
         (octaves, width) for octaves in (-1.0, -2.5, -4.0, -6.0) for width in (0.003, 0.03)])
-    # Nothing is known of the noise yet: it counts as left over.
+    # The noise is not known yet: it counts as unexplained.
     if not family.beats(slow, play_alone, 0.0):
         return None
-    # Along a ramp, a small error of its slope adds up.
+    # Once more: along a ramp, a small error of its slope adds up.
     octaves = family.best(following, [slow.at]).at[0]
     return float(family.swing * largest * 2.0**octaves)
 
 
 def _many(v: Array, widest: float, share: float) -> Array:
-    """Plays of all widths up to the widest in parallel, and a share of v itself beside them."""
+    """Mean of plays of all widths up to the widest, in parallel with a share of v itself."""
     widths = abs(widest) * np.linspace(0.04, 0.96, 12, dtype=np.float64)
     held = play(v, widths, v[0] + 0.5 * widths) - 0.5 * widths[:, None]
     share = min(max(share, 0.0), 1.0)
@@ -245,8 +245,8 @@ def _many(v: Array, widest: float, share: float) -> Array:
 
 
 def _sticking(v: Array, band: float, jump: float) -> Array:
-    """Stick band behind each turn of v, and the jump at its end (M. A. A. Shoukat Choudhury, N. F.
-    Thornhill, S. L. Shah, Control Eng. Practice 13 (2005) 641-658)."""
+    """Stiction: a stick band after each turn of v, and a jump at its end (M. A. A. Shoukat
+    Choudhury, N. F. Thornhill, S. L. Shah, Control Eng. Practice 13 (2005) 641-658)."""
     band, jump = abs(band), min(abs(jump), abs(band))
     place = stop = last = float(v[0])
     way, out = 0, []
@@ -262,22 +262,22 @@ def _sticking(v: Array, band: float, jump: float) -> Array:
     return np.array(out)
 
 
-# --- what moves y beside v ------------------------------------------------------------------------
+# --- what moves y besides v, or holds it ----------------------------------------------------------
 
 
 def _runs(flags: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
-    """The indices of each run of true ones."""
+    """The indices of each run of true flags."""
     true = np.flatnonzero(flags)
     return np.split(true, np.flatnonzero(np.diff(true) > 1) + 1) if len(true) else []
 
 
 def _held(o: Observed) -> str:
-    """A y that is seen at its end while v goes on."""
+    """Report a y that rests at an end of its range while v goes on."""
     known = np.isfinite(o.y)
-    # About 1 or -1, but next to 0 where G integrates.
+    # About 1 or -1, but near 0 if G integrates.
     along = float(np.corrcoef(o.v[known], o.y[known])[0, 1])
     within = 4.0 * o.noise + 0.005 * o.swing
-    # What would move y by far more, if it moved.
+    # Travel of v that would move y by far more than `within` if it moved y at all.
     far = max(0.1, 3.0 * within / o.swing) * float(np.ptp(o.v))
     for end, way in ((np.nanpercentile(o.y, 98.0), 1.0), (np.nanpercentile(o.y, 2.0), -1.0)):
         on = [float(np.max((o.v[run] - o.v[run[0]]) * way * np.sign(along)))
@@ -289,25 +289,25 @@ def _held(o: Observed) -> str:
 
 
 def _pushed(o: Observed) -> str:
-    """A y that moves while v is at rest."""
-    settled = 8  # samples of v at rest, behind as many in which y settles
+    """Report a y that moves while v is at rest."""
+    settled = 8  # samples of rest in which y settles, and least number to judge after them
     rest = np.append(False, (np.diff(o.v) == 0.0) & (np.diff(o.p) == 0.0))
     parts = [o.residual[run[settled:]] for run in _runs(rest)]
     moved = [float(np.nanmax(part) - np.nanmin(part)) for part in parts
              if np.isfinite(part).sum() >= settled]
-    # Of white noise, the range of a few dozen readings is some four deviations.
+    # The range of a few dozen readings of white noise is some four standard deviations.
     clear = [size for size in moved if size > max(5.0 * o.noise, 0.02 * o.swing)]
     return '' if len(clear) < max(2.0, 0.2 * len(moved)) else (
         f'y moves by up to {max(clear):.3g} while v is at rest: something else moves the load')
 
 
 def _creep(o: Observed) -> str:
-    """A y that goes away though v returns."""
+    """Report a y that drifts away although v returns."""
     f = LinearFamily(o.v, o.y)
-    # Of a G that integrates, y is where it has been driven to.
+    # If G integrates, its input may have driven y away: compared with and without an integral.
     columns = f.columns((o.p - f.low) / f.swing)
     left, without = f.solved(columns[:, :-1])
-    # The integral of a p that is not about 0 on the average is a drift of its own.
+    # If the mean of p is not about 0, its integral is a drift of its own.
     by_time = min(float(f.solved(columns)[1][-3]), float(without[-3]), key=abs)
     returning = float(np.ptp(f.target - by_time * f.common[:, 1]))
     turns = float(np.abs(np.diff(o.p)).sum()) / (2.0 * max(float(np.ptp(o.p)), 1e-300))
@@ -315,16 +315,16 @@ def _creep(o: Observed) -> str:
     if not explained or abs(2.0 * by_time) < 0.3 * returning or turns < 3.0:
         return ''
     return (f'y creeps by {2.0 * by_time:.3g} over the record, {2.0 * by_time / turns:.3g} for '
-            'each motion to and fro, though v returns: the way is not the same in both directions, '
+            'each motion to and fro, though v returns: the travel differs between the directions, '
             'or y drifts')
 
 
-PARALLEL = [(widest, share) for widest in (0.1, 0.3, 0.7) for share in (0.0, 0.4)]  # of _many
+PARALLEL = [(widest, share) for widest in (0.1, 0.3, 0.7) for share in (0.0, 0.4)]  # for _many
 
 # --- what is compared -----------------------------------------------------------------------------
 
-# A nonlinearity, where to begin (of the width of the best play), what to say of it by its
-# parameters as sizes [v] and as places [v], and the cure.
+# A nonlinearity; its starts, given the width of the best play; what to say of it, with its
+# parameters as sizes [v] and as `places` [v]; and the cure.
 NONLINEARITIES: tuple[tuple[
     Callable[..., Array], Callable[[float], Sequence[At]], str, str], ...
 ] = (
@@ -337,28 +337,28 @@ NONLINEARITIES: tuple[tuple[
     (lambda v, low, high: v - np.clip(v, min(low, high), max(low, high)),
      lambda _: [(middle - half, middle + half) for middle in (0.3, 0.5, 0.7)
                 for half in (0.03, 0.1, 0.2, 0.3)],
-     'v does nothing from {places[0]:.4g} to {places[1]:.4g}, from wherever it comes: a dead '
-     'zone, which has no memory, and no backlash',
+     'v does nothing from {places[0]:.4g} to {places[1]:.4g}, wherever it comes from: a dead '
+     'zone, which has no memory, not a backlash',
      'remove it where it is made, it is not compensated here'),
-    # All at once where v turns, or over some of its way.
+    # The lead comes at once when v turns, or over some travel after the turn.
     (lambda v, lead, way: v + abs(lead) * (v - centred(v, way)) / max(abs(way), 1e-9),
      lambda _: [(lead, lead) for lead in (0.003, 0.01, 0.03, 0.1, 0.2, 0.4)],
      'y leads v by {:.3g} where v turns: the drive compensates a backlash already, by too much',
-     'switch that off, or leave it to it'),
+     'switch that off, or leave the compensation to the drive'),
     (_many, lambda _: PARALLEL,
      'many plays in parallel explain it, up to {:.3g} wide: y turns smoothly, as with friction '
      'along the way or in a piezo', 'only a single backlash is compensated here'),
     (_sticking, lambda width: [(wider * width, share * width) for wider, share in (
         (1.05, 0.1), (1.3, 0.4), (1.3, 0.8), (1.0, 0.6))],
-     'y sticks until v has gone on by {:.3g} behind each turn, and jumps by what {:.3g} of v move: '
-     'friction, as in a valve', 'loosen it'),
+     'y sticks after each turn until v has gone on by {:.3g}, then jumps by {:.3g} (as a motion of '
+     'v): friction, as in a valve', 'reduce the friction'),
 )
-BESIDE_V = ((_held, 'move v less far'), (_pushed, 'hold it, or keep it free'),
-            (_creep, 'mend what slips, or measure y without a drift'))
+BESIDE_V = ((_held, 'move v less far'), (_pushed, 'keep other forces off the load'),
+            (_creep, 'fix what slips, or measure y without a drift'))
 
 
 def what_it_is(o: Observed) -> Answer | None:
-    """What else than one play y shows; None where one explains it."""
+    """What y shows other than a single play; None if a play explains it."""
     if not o.unexplained:
         return None
     for test, cure in BESIDE_V:
@@ -368,7 +368,7 @@ def what_it_is(o: Observed) -> Answer | None:
 
 
 def best_other(o: Observed) -> Answer | None:
-    """The best of the nonlinearities that explain y far better than a play does."""
+    """The best of the nonlinearities that explain y far better than a play; None if none does."""
     f, named = o.family, []
     for nonlinearity, starts, said, cure in NONLINEARITIES:
         best = o.best(nonlinearity, starts(abs(o.one_play.at[0])))

@@ -39,7 +39,7 @@ def test_gap_behind_a_drive_of_limited_speed(seed: int, speed: float) -> None:
     assert found.usable
     assert found.gap == pytest.approx(GAP, abs=0.02 * GAP)
     assert abs(found.gap - GAP) < 4.0 * found.std['gap']
-    assert 'per s: the fit is to v limited so' in found.remarks[0]
+    assert 'per s at most: the fit is to v with this limit' in found.remarks[0]
     # A controller whose v is no faster never meets the limit of the drive.
     assert identified_parameters(found, {}).control.rate_max == pytest.approx(speed, rel=0.01)
 

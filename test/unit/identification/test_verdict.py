@@ -28,7 +28,7 @@ def test_a_gap_is_known_though_gain_and_middle_are_not() -> None:
     found = verdict(gain_std=40.0, response_std=0.3)
     assert (found.backlash.known, found.gain.known, found.model.known) == (True, False, True)
     first, second = found.lines
-    assert first.startswith('the gap is 0.6 ± 0.01; the gain of G at rest is known not at all')
+    assert first.startswith('the gap is 0.6 ± 0.01; the gain of G at rest is not known at all')
     assert second == (
         'G is known to 30 %: good enough to start the controller with plant.uncertainty as in '
         'identified.yaml, which learns the rest')
@@ -96,10 +96,10 @@ def test_what_no_model_explains_widens_the_deviations_and_then_refuses() -> None
     some = judge(FOUND._replace(observed=rough))
     assert some.backlash.known
     assert some.gap_std > 1.5 * FOUND.gap_std
-    assert any('the deviations tell of it' in text for text in some.remarks)
+    assert any('the standard deviations include it' in text for text in some.remarks)
     much = judge(FOUND._replace(observed=rough, gain=0.1))
     assert not much.backlash.known
-    assert 'something else than a backlash and a linear G moves y' in much.backlash.reason
+    assert 'something other than a backlash and a linear G moves y' in much.backlash.reason
 
 
 def test_what_is_no_play_is_named_first() -> None:
