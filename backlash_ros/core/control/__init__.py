@@ -1,1 +1,1 @@
-"""From y_m and estimates to v: one step of the controller, its structures, (2.2) and (2.3)."""
+"""The controller: structures that make v from y_m and the estimates, inverse (2.2), (2.3)."""

@@ -1,4 +1,4 @@
-"""The adaptive controller: y_m and y to v, the way of a better G, and a motor in front of G."""
+"""The adaptive controller: makes v from y_m and y, redesigns for a better G, allows for a motor."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from backlash_ros.core.plant.actuator import Actuator, Motor
 from backlash_ros.core.plant.backlash import clamp
 from backlash_ros.core.plant.transfer_function import StateModel
 
-# Lost outputs in a row that are stepped over; after more nothing is left to predict from them.
+# Longest run of lost outputs that prediction bridges; after a longer one the loop begins anew.
 LONGEST_GAP = 1000
-# Samples after which a better design takes over though v crosses the gap: an unstable loop never
-# stops to.
+# Samples after which a better design takes over even while v crosses the gap: in an unstable loop
+# it never stops crossing.
 LONGEST_WAIT = 200
-# Share of the motion of u that may not be what the backlash says, before and after it was learned.
+# Disturbance of u per sample as a fraction of the motion of u, before and after the gap is learned.
 DOUBT, LITTLE_DOUBT = 0.5, 0.1
 
 
 class ControlStep(NamedTuple):
-    """What one sample made: the command, and the estimate it was computed with."""
+    """Result of one sample: the command v, and the inputs and the estimate it was computed from."""
 
     y_m: float
     y: float
@@ -41,12 +41,12 @@ class ControlStep(NamedTuple):
 
 
 class AdaptiveController:
-    """Learns the backlash from v and y and publishes v = BI(u_d), section 3 of the paper.
+    """Learns the backlash from v and y and computes v = BI(u_d), section 3 of the paper.
 
-    Call `step` once per received y, and `refine` when v is on its way. compensating: False inverts
-    the slope alone. motion: of the newest command. redesign: whether the structure is designed anew
-    for the better models of G that the estimator proposes, by the executor. serial: the motor and G
-    as the structure sees them; None where v is what it commands.
+    Call `step` once per received y, and `refine` after v has been sent. compensating: if False, the
+    inverse uses the slope only. motion: of the newest command. redesign: whether the executor
+    designs new gains for each better G that the estimator proposes. serial: motor and G as one
+    plant of the command; None if the command itself is v.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class AdaptiveController:
         self.compensating, self.lost_samples = True, 0
         self.redesign = Redesign((executor or Executor()).open()) if redesign else None
         self._serial = serial
-        self._led: tuple[float, float, float] | None = None  # newest v, y_m and u_d led to it
+        self._led: tuple[float, float, float] | None = None  # the newest v, y_m and u_d
 
     def step(
         self, y: float, y_m: float, lost: int = 0, applied: Sequence[float] = (),
@@ -68,9 +68,9 @@ class AdaptiveController:
     ) -> ControlStep:
         """Learn from y(k), and return the command for sample k, within the limits.
 
-        lost: samples that never arrived since the last call. Of each of the lost + 1 intervals,
-        if it is known: applied, the v that was; commands, those that acted if not the last one;
-        alternatives, those that may have acted instead, nan where none may.
+        lost: samples that never arrived since the last call. The sequences have one value for each
+        of the lost + 1 intervals, or are empty: applied, the v that was reported; commands, the
+        command that acted (default: the last one); alternatives, another that may have, or nan.
         """
         if not (plausible(y) and plausible(y_m) and all(map(plausible, (*applied, *commands)))):
             raise ValueError(
@@ -103,28 +103,28 @@ class AdaptiveController:
         return ControlStep(y_m, y, u_d, v, estimate)
 
     def refine(self) -> None:
-        """Do what the command did not have to wait for; who has no time for it leaves it out."""
+        """Do the work that the command need not wait for; may be left out if time is short."""
         self.structure.prepare()
         self.estimator.refine()
         if self.redesign is not None:
             gains = self.redesign.due(self.estimator.proposal, self.structure, self._serial)
             if gains is not None:
-                # At once and together: x_hat and gains of two models do not fit each other.
+                # Both within one sample: x_hat of one model does not fit the gains of another.
                 self._adopt(self.redesign.considered)
                 self.structure.adopt(gains, self._source)
 
     def command_of(self, v: float) -> float:
-        """The command at which the motor rests at a v that was reported."""
+        """The command that holds the motor at rest at the reported v."""
         return v if self._serial is None else v / self._serial.actuator.gain
 
     def start_from(self, v: float) -> None:
-        """Say which command acts now, so that the first one goes on from there."""
+        """Set the command that acts now, from which the first command continues."""
         if v != self.motion.v:
             self.motion = at_rest(v)
         self.inverse.start_from(v)
 
     def go_on_from(self, before: AdaptiveController) -> None:
-        """Go on where `before` ends, with v and the learned G; the state got unknown."""
+        """Take over v, structure and learned G from `before`; the plant state becomes unknown."""
         self.inverse, self.motion, self.structure = before.inverse, before.motion, before.structure
         if self.redesign is not None and before.redesign is not None:
             self.redesign.considered = before.redesign.considered
@@ -132,12 +132,12 @@ class AdaptiveController:
         self.structure.restart()
 
     def retune(self, p: Parameters) -> None:
-        """Take up new values of parameters of law and structure; what was learned stays."""
+        """Apply new values of the live parameters of law and structure; keep what was learned."""
         self.estimator.retune(p)
         self.structure.retune(p, self._source)
 
     def close(self) -> None:
-        """Give back what estimator and designs hold elsewhere."""
+        """Release what the estimator and the redesign hold in the executor."""
         self.estimator.close()
         if self.redesign is not None:
             self.redesign.channel.close()
@@ -151,37 +151,37 @@ class AdaptiveController:
 
     @property
     def _source(self) -> Law:
-        """What knows the state of the plant of v."""
+        """The law or observer that estimates the state of the plant which the command drives."""
         return self.estimator if self._serial is None else self._serial.observer
 
 
 @dataclass
 class Redesign:
-    """Has gains made for the better models of G that the estimator proposes, one at a time."""
+    """Designs gains for each better G that the estimator proposes, one at a time."""
 
-    channel: Channel  # where they are made
-    adopted: StateModel | None = None  # the learned G that is in use
-    considered: StateModel | None = None  # the proposal that was designed for last
-    failed: int = 0  # designs without a result
-    _gains: object | None = None  # that are made and could not take over yet
-    _waited: int = 0  # samples for which they could not
+    channel: Channel  # computes the designs
+    adopted: StateModel | None = None  # the learned G in use
+    considered: StateModel | None = None  # the newest proposal that a design was begun for
+    failed: int = 0  # designs that failed
+    _gains: object | None = None  # finished gains that wait to take over
+    _waited: int = 0  # samples for which they have waited
 
     def due(
         self, proposal: StateModel | None, structure: ControlStructure, serial: SerialPlant | None,
     ) -> object | None:
-        """Gains for `considered` that take over now, None for none. proposal: the newest G."""
+        """Return gains for `considered` if they may take over now, else None. proposal: a new G."""
         if proposal is not None and proposal is not self.considered and not self.channel.busy:
             self.considered, self._gains, self._waited = proposal, None, 0
             model = proposal if serial is None else serial.before(proposal)
             job = structure.redesign(model)
             if job is None:
-                self._gains = ()  # the better G alone takes over
+                self._gains = ()  # no gains to design: only the better G takes over
             else:
                 self.channel.submit(job)
         found = self.channel.poll()
         if isinstance(found, Failure):
             if found.kind == LOST:
-                self.considered = None  # the same again, by another worker
+                self.considered = None  # the worker died: try the same proposal again
             else:
                 self.failed += 1
         elif found is not None:
@@ -196,30 +196,30 @@ class Redesign:
 
 
 class SerialPlant:
-    """A motor with its position loop L(z), and G behind it, as one plant of the command.
+    """A motor with its position loop L(z), and G behind it, as one plant from command to y.
 
-    Where v is the position of a motor encoder, the estimator learns G from that; the structure
-    however commands the motor, and y answers as L(z) G(z) does. The gap and L change places in it,
-    as L takes less time than a motion: it inverts the gap with the wind-up of the motor added.
+    Where v is measured by a motor encoder, the estimator learns G from that v, but the structure
+    commands the motor, and y responds as L(z) G(z). As L is fast beside any motion, the gap is
+    modelled in front of L: the inverse uses crossings widened by the wind-up of the motor.
     """
 
     def __init__(self, actuator: Actuator, model: StateModel, noise_std: float) -> None:
         self.actuator, self._noise_std, self._motor = actuator, noise_std, Motor(actuator)
-        # What the gap holds, in units of v and of the command: its middle where it begins.
+        # Play outputs p behind v and behind the command; nan until they start in mid-gap.
         self._play = self._commanded = nan
         self._learned = False
-        # u and y, from which a new observer finds the state.
+        # Newest (u, y), from which a new observer recovers the state.
         self._newest: deque[tuple[float, float | None]] = deque(maxlen=60)
         self.adopt(self.before(model))
 
     def before(self, model: StateModel) -> StateModel:
-        """L G for a G."""
+        """Return L(z) G(z) for this model of G."""
         return StateModel(self.actuator.in_front_of(model.transfer_function))
 
     def adopt(self, model: StateModel) -> None:
-        """Give x_hat for this L G from now on."""
+        """Estimate the state of this model of L(z) G(z) from now on."""
         self._model = model
-        # It is told u: to the observer there is no backlash.
+        # The observer is given u, so it needs no backlash of its own.
         self.observer = FixedBacklash(Estimate(1.0, 0.0, 0.0, 0.0), model, self._noise_std,
                                        LITTLE_DOUBT if self._learned else DOUBT)
         self._variance, self._taken, self._refused = 0.0, 0, 0
@@ -227,20 +227,20 @@ class SerialPlant:
             self._follow(y, u)
 
     def for_command(self, estimate: Estimate) -> Estimate:
-        """The estimate with its crossings as the command meets them."""
+        """Return the estimate with the crossings converted from v to the command."""
         c_r, c_l = self.actuator.crossings(estimate.c_r, estimate.c_l)
         return replace(estimate, c_r=c_r, c_l=c_l)
 
     def update(
         self, y: float | None, command: float, applied: float | None, estimate: Estimate,
     ) -> float:
-        """Take in y(k), None if lost, and the command of the interval before it; return its v."""
+        """Take in y(k) (None if lost) and the command before it; return the v of that interval."""
         c_r, c_l, gap = estimate.c_r, estimate.c_l, estimate.c_r - estimate.c_l
         play = command * self.actuator.gain + c_r if isnan(self._play) else self._play
         position = self._motor.step(command, play - c_r, c_r, c_l)
-        v = position if applied is None else applied  # as it was reported
+        v = position if applied is None else applied  # the reported v, if there is one
         self._play = clamp(v + 0.5 * gap if isnan(self._play) else self._play, v, v + gap)
-        # Nothing is known of the gap before it was learned.
+        # Before the gap is learned, assume none.
         seen = self.for_command(
             estimate if estimate.learned else replace(estimate, c_r=0.0, c_l=0.0))
         gap = seen.c_r - seen.c_l
@@ -255,11 +255,11 @@ class SerialPlant:
         return v
 
     def _follow(self, y: float | None, u: float) -> None:
-        averaged = 100  # innovations, of whose rms y may differ: they come in bursts at crossings
+        averaged = 100  # innovations in the variance that outliers are judged by: bursts at turns
         observer = self.observer
         if y is not None and self._taken >= averaged:
             least = max(self._variance, self._noise_std**2)
-            # So many outliers in a row are none.
+            # OUTLIERS rejected in a row cannot be outliers: the model is off.
             if (y - observer.predicted(u)) ** 2 > 100.0**2 * least and self._refused < OUTLIERS:
                 self._refused += 1
                 y = None

@@ -1,7 +1,7 @@
-"""Motion of v that shows a backlash without hurting anybody: within a range, at limited speed.
+"""Motion of v that reveals a backlash safely: within a range and at limited speed.
 
-At several speeds, amplitudes and rests, in both directions: a lag shows as a gap that grows with
-the speed, and with one speed only, they could not be told apart.
+It has several speeds, amplitudes and rests, in both directions: a lag looks like a gap that grows
+with the speed, so at a single speed the two could not be told apart.
 """
 
 from collections.abc import Iterator
@@ -13,9 +13,9 @@ from backlash_ros.core.parameters import ParameterError, Parameters
 
 
 def drive_limits(p: Parameters, amplitude: float | None, rate: float | None) -> Limits:
-    """What both the parameters and the options allow.
+    """Return the limits that both the parameters and the command-line options allow.
 
-    Raises ParameterError where a limit is missing or the limits exclude each other.
+    Raises ParameterError if a limit is missing or no range is left.
     """
     excursion, period = inf if amplitude is None else amplitude, p.sample_period
     low, high = max(p.control.min, -excursion), min(p.control.max, excursion)
@@ -34,7 +34,7 @@ def drive_limits(p: Parameters, amplitude: float | None, rate: float | None) -> 
 
 
 class Drive:
-    """v(k) along strokes, from v on, within limits."""
+    """Makes v(k) along `strokes`, from a starting v, within limits."""
 
     def __init__(
         self, limits: Limits, sample_period: float, duration: float, v: float = 0.0,
@@ -44,29 +44,29 @@ class Drive:
                                 sample_period, duration, v)
 
     def step(self) -> float:
-        """The next v."""
+        """Return the next v."""
         self._motion = self._limits.apply(next(self._strokes), self._motion)
         return self._motion.v
 
     def to_rest(self) -> Iterator[float]:
-        """v from here to 0, or to the limit next to it, where it stays."""
+        """Yield v from here to 0, or to the bound nearest to 0, where it stays."""
         return last_commands('ramp', self._motion, lambda: self._limits)
 
 
 def strokes(
     low: float, high: float, rate: float, period: float, duration: float, v: float,
 ) -> Iterator[float]:
-    """v(k), one per sample, without end: strokes at up to the speed limit, with rests between,
-    which show what is fast in G; some 24 across the range within the duration [s]."""
+    """Yield v(k) without end: strokes at up to the speed limit, some 24 across the range within
+    the duration [s], with rests between them, in which the fast modes of G show."""
     golden, silver, bronze = 0.6180339887, 0.4142135624, 0.3027756377  # spread evenly, never repeat
     ordinary = min(rate, 24.0 * (high - low) / duration)
     up = v <= 0.5 * (low + high)
     for k in count():
-        # Two strokes from end to end, for a gap may be nearly as wide, then two short ones.
+        # Two full strokes, as a gap may be nearly as wide as the range, then two short ones.
         part = 1.0 if k % 4 < 2 else 0.35 + 0.55 * (k * golden % 1.0)
         target = v + part * ((high - v) if up else (low - v))
-        target = min(max(target, low), high)  # whatever rounding does
-        # Every third is as fast as the actuator may move.
+        target = min(max(target, low), high)  # despite rounding
+        # Every third stroke is as fast as the actuator may move.
         move = period * (rate if k % 3 == 2 else ordinary * 0.15 ** ((0.13 + k * silver) % 1.0))
         while v != target:
             v = min(v + move, target) if v < target else max(v - move, target)

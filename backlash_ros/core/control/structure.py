@@ -1,6 +1,6 @@
-"""The structures turn y_m into u_d and v: what each offers, and those of the papers.
+"""Control structures, which compute u_d and v from y_m: their interface, and two from papers.
 
-u_d = y_m + f v (3.2), and the four blocks of Tao and Kokotović; `tracking` stands beside.
+u_d = y_m + f v (3.2), and the four blocks of Tao and Kokotović; the third one is in tracking/.
 """
 
 from collections.abc import Callable
@@ -18,28 +18,28 @@ from backlash_ros.core.plant.backlash import GAP, LEFT, RIGHT, Region
 from backlash_ros.core.plant.numerics import FourBlocks
 from backlash_ros.core.plant.transfer_function import Array, StateModel
 
-# (m - f) divides: f beyond this share of m would multiply every error in m by more than five.
+# Largest f / m: u_d has the divisor m - f, so more would amplify errors of m over fivefold.
 LARGEST_F_OVER_M = 0.8
-# Largest feedback, whatever y does, in units of the u that the reference has asked for so far or
-# that the gap takes: while the backlash is unknown, as wrong as a first guess may be; later what
-# leads y back from where it has gone until then.
+# Bounds of feedback, as multiples of the largest u that the reference has asked for so far, or of
+# m (c_r - c_l) if that is larger. While the backlash is unknown: the factor by which a first guess
+# may be wrong; later: enough to lead y back from where it has gone until then.
 LARGEST_IN_ACQUISITION, LARGEST_FEEDBACK = 10.0, 100.0
 
 
 class ControlInput(NamedTuple):
-    """What is known at a sample."""
+    """Inputs of a control structure at one sample."""
 
     y_m: float
     y: float
     estimate: Estimate
-    source: Law  # of x_hat
-    limits: Limits = Limits()  # that v meets
+    source: Law  # provides x_hat
+    limits: Limits = Limits()  # of v
 
 
 class ControlStructure:
-    """Makes u_d from the reference and drives the inverse with it.
+    """Computes u_d from the reference, and v from u_d by the inverse.
 
-    Structures inherit from here what a better G does not change.
+    The defaults are those of a structure whose gains do not depend on G.
     """
 
     delay: int = 0  # samples by which y is meant to follow y_m
@@ -50,35 +50,35 @@ class ControlStructure:
         return True
 
     def control(self, inputs: ControlInput, inverse: BacklashInverse) -> float:
-        """Return the desired input u_d of G; advances the inverse to the v that shall cause it."""
+        """Return the desired input u_d of G, and step the inverse to the v that produces it."""
         raise NotImplementedError
 
     def prepare(self) -> None:
-        """Do what the next command need not wait for; the next one does it where nobody asks."""
+        """Do what the next command need not wait for; `control` does it unless this was called."""
 
     def redesign(self, model: StateModel) -> Callable[[], object | None] | None:
-        """What makes gains for a better G in any process, or None if unsafe; None: none to make."""
+        """Return a job that designs gains for this G (None if none are safe), or None: no gains."""
         return None
 
     def adopt(self, gains: object, source: Law) -> None:
-        """Use such gains from the next sample on, without a jump of v; source: of their x_hat."""
+        """Use these gains from the next sample on, without a jump of v; source: provides x_hat."""
 
     def restart(self) -> None:
-        """Go on although x_hat begins anew, and the reference may have gone on meanwhile."""
+        """Continue after an interruption: x_hat begins anew, and y_m may have moved meanwhile."""
 
     def retune(self, p: Parameters, source: Law) -> None:
-        """Take up new values of live parameters from the next sample on; source: as in `adopt`."""
+        """Apply new values of live parameters from the next sample on; source: as in `adopt`."""
 
 
 class Proportional(ControlStructure):
-    """u_d = y_m + f v (3.2) with v = BI(u_d) (2.3): each needs the other.
+    """Solves the algebraic loop u_d = y_m + f v (3.2), v = BI(u_d) (2.3).
 
     On the branch with crossing c the loop has one solution, u_d = m (y_m + f c) / (m - f). The
-    branch counts when the direction of u_d agrees with it. m = f is singular: f is limited.
+    branch is valid if u_d moves in its direction. m = f is singular, so f is limited.
     """
 
     def __init__(self) -> None:
-        self._estimate: Estimate | None = None  # that v was made with
+        self._estimate: Estimate | None = None  # used for the newest v
 
     def control(self, inputs: ControlInput, inverse: BacklashInverse) -> float:
         """Return u_d so that it and v satisfy (3.2) and (2.3) together."""
@@ -88,8 +88,8 @@ class Proportional(ControlStructure):
             return y_m  # first case of (2.3)
         before, self._estimate = self._estimate, e
         if before is not None and before is not e and inverse.take_up < inf:
-            # The inverse is slow only as far as u does not move: it cannot tell what u_d, or the
-            # line that it lies on, owe to a new estimate.
+            # The inverse limits v only while u is held: it cannot tell how much of a move of u_d,
+            # or of its line, is due to a new estimate.
             now, then = (_on_the_line(y_m, estimate, inverse.side) for estimate in (e, before))
             if abs(now - then) > inverse.take_up:
                 inverse.slow_down()
@@ -100,7 +100,7 @@ class Proportional(ControlStructure):
             by_m, by_c = f * (y_m + f * c_r) / (m - f) ** 2, m * f / (m - f)
             band = max(band, 3.0 * hypot(by_m * e.std_m, by_c * max(e.std_c_r, e.std_c_l)))
         right, left = m * (y_m + f * c_r) / (m - f), m * (y_m + f * c_l) / (m - f)
-        # Where both directions solve the loop, the smaller move is the one a shaft would make.
+        # If both branches are valid, take the smaller move, as a shaft would.
         v, held = inverse.v, y_m + f * inverse.v
         solutions = (RIGHT, right), (LEFT, left)
         if abs(right / m + c_r - v) > abs(left / m + c_l - v):
@@ -108,10 +108,10 @@ class Proportional(ControlStructure):
         if inverse.taking_up:
             for side, u_d in solutions:
                 if side is inverse.side and inverse.direction(u_d, band) is GAP:
-                    # u_d rests, v goes on to its line.
+                    # u_d rests while v continues to its line.
                     return y_m + f * inverse.step(u_d, m, c_r, c_l, band)
         elif (
-            abs(held - inverse.extreme) <= 1e-12 * (abs(held) + abs(v))  # but for rounding
+            abs(held - inverse.extreme) <= 1e-12 * (abs(held) + abs(v))  # up to rounding
             or inverse.direction(held, band) is GAP
         ):
             return held  # first case of (3.3): u_d rests, and so does v
@@ -130,15 +130,15 @@ class Proportional(ControlStructure):
 
 
 def _on_the_line(y_m: float, e: Estimate, side: Region) -> float:
-    """v on the line of a side."""
+    """Return the v that solves (3.2) on the line of this side."""
     c = e.c_r if side is RIGHT else e.c_l
     return c + (y_m + e.f * c) / (e.m - min(e.f, LARGEST_F_OVER_M * e.m))
 
 
 class PolePlacement(ControlStructure):
-    """u_d from the four blocks (numerics.py), v = BI(u_d); the gains stay those of a nominal G.
+    """Computes u_d by the four blocks (numerics.py) for the nominal G, and v = BI(u_d).
 
-    delay: what B/A_m delays a slow reference by, rounded to samples.
+    delay: by which B/A_m delays a slow reference, rounded to samples.
     """
 
     def __init__(self, blocks: FourBlocks) -> None:
@@ -146,15 +146,15 @@ class PolePlacement(ControlStructure):
         size = len(blocks.filter) - 1
         self._companion = np.eye(size, k=-1)
         self._companion[:1] = -blocks.filter[1:]
-        self._w: Array = np.zeros((2, size))  # of u_d and of y
-        # r and what it asks for, newest first.
+        self._w: Array = np.zeros((2, size))  # w_1 of u_d and w_2 of y
+        # The references, and the u_d that they ask for without disturbances, newest first.
         self._r: Array = np.zeros(len(blocks.demand[0]))
         self._asked: Array = np.zeros(len(blocks.demand[1]) - 1)
-        self._largest_asked = 0.0  # largest of it so far
+        self._largest_asked = 0.0  # largest |u_d| that was asked for so far
         self.delay = round(blocks.reference.group_delay)
 
     def control(self, inputs: ControlInput, inverse: BacklashInverse) -> float:
-        """Return u_d, no further than feedback may go from what r asks for."""
+        """Return u_d, no further from what the references ask for than the bound of feedback."""
         blocks, e, (w_1, w_2) = self._blocks, inputs.estimate, self._w
         u_d = float(blocks.theta_1 @ w_1 + blocks.theta_2 @ w_2)
         u_d += blocks.theta_20 * inputs.y + blocks.theta_3 * inputs.y_m
