@@ -1,1 +1,1 @@
-"""The structure that lets y follow y_m: gains, preview, behaviour at rest."""
+"""The structure that makes y follow y_m: gains, preview, behaviour at rest."""

@@ -1,12 +1,12 @@
-"""From G to the gains of the tracking structure: pure functions, fit for another process.
+"""Gains of the tracking structure for a model of G: pure functions, for any process.
 
 LQ tracking of a reference that is known for some samples ahead minimises
 sum (y - r)^2 + w_i q^2 + rho (u - u_r)^2 with the integral q(k+1) = q(k) + r(k) - y(k):
 
     u(k) = -K z(k) - sum_{j=0..N} f_j r(k+j),   z = [x; q]
 
-u_r is what holds y at r: r / G(1), as much earlier as G delays slow motion; 0 where G integrates.
-A weight of u itself would leave y short of r. r stays at its last known value beyond the window.
+u_r is the u that holds y at r: r / G(1), earlier by the delay of G for slow motion; 0 if G
+integrates. Weighting u itself would leave y short of r. Beyond the window r keeps its last value.
 
 Reference: M. Tomizuka, Optimal continuous finite preview problem, IEEE Trans. Automatic Control
 20 (1975) 362-365; A. Bemporad, lecture form of the affine Riccati recursion.
@@ -27,19 +27,19 @@ from backlash_ros.core.plant.transfer_function import Array, StateModel, Transfe
 
 Gain = list[float]
 
-# Times the input weight of feedback: the softer gains are for noise, and up to SOFTEST for the time
-# while v meets its limits or the estimate is new; that one while the backlash is unknown.
+# Factors on the input weight of feedback. The softer gains are for noise; those up to SOFTEST also
+# while v meets its limits or the estimate is new; SOFTEST itself while the backlash is unknown.
 SCHEDULE = (1.0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6)
 SOFTEST = 4
-# The same for the ideal trajectory: one that asks for less is moved less by noise of y_m.
+# The same for the ideal trajectory: the larger the weight, the less noise of y_m moves it.
 SOFTER = (1.0, 1e2, 1e4)
-# Times the input weight with which feedback around a better G is tried in turn, until its loop is
-# as safe as the one it replaces. The trajectory keeps the weight that was asked for.
+# Factors on the input weight that are tried in turn for feedback around a better G, until the loop
+# is as robust as the one it replaces. The trajectory keeps the weight that was configured.
 SAFER = (1.0, *np.geomspace(1.1, 100.0, 60).tolist())
-HORIZON = 300  # samples within which a wrong u must matter, and u* answers to a reference
+HORIZON = 300  # samples over which responses to u, and to noise of the references, are summed up
 LOOK_AHEAD = 20  # samples, at most, for which u* is known ahead
 # Variance of the disturbance per sample, seen in y, over that of the noise on y: from an observer
-# that believes its model to one that believes y alone.
+# that trusts its model to one that trusts y alone.
 CONFIDENCES = (1e-4, 1e-1, 1e2, 1e5)
 
 
@@ -51,19 +51,19 @@ class PreviewGains(NamedTuple):
     preview: Array
 
 
-# A controller restarts in the middle of a loop, and must not wait for them then.
+# Cached: a controller that restarts in the middle of a loop must not wait for them.
 @lru_cache(maxsize=64)
 def preview_gains(
     model: StateModel, input_weight: float, integral_weight: float = 0.0, window: int = 0,
 ) -> PreviewGains:
-    """Gains for rho = input_weight > 0, w_i = integral_weight >= 0, N = window >= 0.
+    """Return the gains for rho = input_weight > 0, w_i = integral_weight >= 0, N = window >= 0.
 
-    Raises ParameterError where G cannot be stabilised or, with w_i > 0, has a zero at z = 1.
+    Raises ParameterError if G cannot be stabilised or, with w_i > 0, has a zero at z = 1.
     """
     n, integrates = model.order, integral_weight > 0.0
     size = n + integrates
     a, b, c, e = np.zeros((size, size)), np.zeros(size), np.zeros(size), np.zeros(size)
-    # u in units of 1/sqrt(rho): the Riccati equation is then solved with weights of one size.
+    # u in units of 1/sqrt(rho), so that all weights in the Riccati equation are of one size.
     unit = input_weight**-0.5
     a[:n, :n], b[:n], c[0] = model.a, model.b * unit, model.c
     q: Array = np.asarray(np.outer(c, c), np.float64)
@@ -81,7 +81,7 @@ def preview_gains(
     gain = share @ p @ a
     closed = a - np.outer(b, gain)
     preview = _preview(share, closed, p @ e, c, window) * unit
-    # u = u_r + u': what is weighed is u', and u_r drives G besides.
+    # u = u_r + u': only u' is weighted, and u_r drives G as a known input.
     by_u_r = _preview(share, closed, p @ b, np.zeros(size), window)
     by_u_r[0] -= 1.0
     of_each = np.convolve(by_u_r, _holding(model.transfer_function, window))
@@ -91,9 +91,9 @@ def preview_gains(
 
 
 def _preview(share: Array, closed: Array, first: Array, c: Array, window: int) -> Array:
-    """Gains f_0 .. f_N of a signal w in z(k+1) = A z + B u + e w, from P e = first, and y - w.
+    """Gains f_0 .. f_N for a known w in z(k+1) = A z + B u + e w and the error c'z - w; first: P e.
 
-    The backward recursion of the affine term s: u = -K z - share' (P e w(k) + s(k+1)).
+    Backward recursion of the affine term s of the cost: u = -K z - share' (P e w(k) + s(k+1)).
     """
     gains = np.empty(window + 1)
     gains[0] = share @ first
@@ -101,19 +101,19 @@ def _preview(share: Array, closed: Array, first: Array, c: Array, window: int) -
     for j in range(1, window + 1):
         gains[j] = share @ row
         row = closed.T @ row
-    # Held beyond the window: the geometric rest of the sum belongs to the last known value.
+    # w is held beyond the window, so the remaining geometric series multiplies its last value.
     gains[window] += share @ np.linalg.solve(np.eye(len(c)) - closed.T, row)
     return gains
 
 
 def _holding(model: TransferFunction, window: int) -> Array:
-    """h with u_r(k) = sum_j h_j r(k+j), shape (N + 1,)."""
+    """Return h of u_r(k) = sum_j h_j r(k+j), shape (N + 1,)."""
     taps = np.zeros(window + 1)
     b, a = model.numerator, model.denominator
     b_1, a_1 = float(b.sum()), float(a.sum())
-    # Less than rounding of the coefficients is a zero or a pole at z = 1.
+    # G has a zero or a pole at z = 1 if a sum vanishes but for rounding of the coefficients.
     if abs(b_1) <= 1e-9 * np.abs(b).sum() or abs(a_1) <= 1e-9 * np.abs(a).sum():
-        return taps  # nothing holds y, or u = 0 does
+        return taps  # no u holds y, or u = 0 does
     whole, part = divmod(min(max(model.group_delay, 0.0), float(window)), 1.0)
     taps[int(whole)] = 1.0 - part
     taps[min(int(whole) + 1, window)] += part
@@ -125,37 +125,37 @@ class Plan(NamedTuple):
 
     gains: PreviewGains
     closed: Array  # transition F of z, shape (n + 1, n + 1)
-    states: Array  # u* of the next L samples, of z: shape (L, n + 1)
-    references: Array  # and of the references: shape (L, N + 1)
+    states: Array  # from z to u* of the next L samples, shape (L, n + 1)
+    references: Array  # the same from the references, shape (L, N + 1)
     noise_gains: Array  # see ReferenceWindow
-    x_noise: tuple[Array, ...]  # covariances of x* for noise of 1 in references, for each average
+    x_noise: tuple[Array, ...]  # covariance of x* for unit noise on r, for each width of averaging
 
 
 class TrackingDesign(NamedTuple):
-    """Gains of one model of G, shape (n,) where they are of x."""
+    """What is designed for one model of G; gains of x have the shape (n,)."""
 
     model: StateModel
     factor: float  # see feedback_around
-    plans: tuple[Plan, ...]  # each weighs u more than the one before, for references with noise
-    feedback: PreviewGains  # of the deviations from them
-    schedule: tuple[Gain, ...]  # that of full feedback first
-    acquisition: Gain | None  # while the backlash is unknown; None where no feedback is better
-    gentle: Gain  # at rest
+    plans: tuple[Plan, ...]  # with larger and larger weights of u, for noisy references
+    feedback: PreviewGains  # for deviations from the plan
+    schedule: tuple[Gain, ...]  # from full feedback to the softest
+    acquisition: Gain | None  # while the backlash is unknown; None if no feedback is better
+    gentle: Gain  # brings y back at rest
     push: float  # |x| after HORIZON samples of u = 1
-    push_ahead: float  # |y| after LOOK_AHEAD
-    holding: list[tuple[Array, Array]]  # see _agreed, for each of the schedule
+    push_ahead: float  # |y| after LOOK_AHEAD samples of u = 1
+    holding: list[tuple[Array, Array]]  # see _agreed, for each gain of the schedule
 
     def variances(self, x_cov: Array) -> Array:
-        """Of K x for every gain of the schedule, and of |x| at last."""
+        """Variances of K x for each gain of the schedule, then of |x|."""
         gains = np.array(self.schedule)
         return np.append(((gains @ x_cov) * gains).sum(axis=1), x_cov.trace())
 
 
 def design(model: StateModel, weights: TrackingWeights, factor: float = 1.0) -> TrackingDesign:
-    """The gains for a model of G; raises ParameterError where there are none."""
-    rest_bandwidth = 1.0 / 80.0  # rad per sample, up to which y is corrected at rest
-    # A slope, in first guesses. Plants that bear less are led astray by any feedback that would
-    # help, and learn faster than they go astray without.
+    """Design all gains for a model of G; raises ParameterError if there are none."""
+    rest_bandwidth = 1.0 / 80.0  # [rad/sample] up to which y is corrected at rest
+    # True slope over its first guess that acquisition feedback has to bear. With a plant that bears
+    # less, any useful feedback leads y astray; without, the backlash is learned before y is lost.
     wrong_slope = 1.35
     rho = weights.input_weight * power_gain(model.transfer_function, np.pi / 10.0)
     plans = tuple(
@@ -178,10 +178,10 @@ def design(model: StateModel, weights: TrackingWeights, factor: float = 1.0) -> 
 def better_design(
     model: StateModel, weights: TrackingWeights, present: TrackingDesign,
 ) -> TrackingDesign | None:
-    """Return the design for a better model of G, None where it is no safe replacement."""
-    # The modulus margin that is safe in any case, without a sensitivity above 2, or else that of
-    # the present loop around its own G or around the better one. The weight of the input is raised
-    # as far as this takes and no further: the loop is the measure for the next G.
+    """Return the design for a better model of G, or None if there is no safe one."""
+    # A modulus margin of 0.5, that is a sensitivity below 2, is safe; otherwise that of the present
+    # loop is required, around its own G or around the better one. The input weight is raised no
+    # further than this takes, as the loop becomes the measure for the next G.
     needed = 0.5
     try:
         for factor in SAFER:
@@ -199,35 +199,35 @@ def better_design(
 def feedback_around(
     model: StateModel, weights: TrackingWeights, factor: float = 1.0,
 ) -> PreviewGains:
-    """Of deviations from the trajectory, as if the input weighed so many times as much."""
+    """Gains for deviations from the trajectory, with `factor` times the input weight."""
     rho = weights.input_weight * power_gain(model.transfer_function, np.pi / 10.0)
     return preview_gains(model, factor * rho, weights.integral_weight)
 
 
 def power_gain(model: TransferFunction, frequency: float) -> float:
-    """|G|^2 at so many rad per sample."""
+    """|G|^2 at a frequency [rad/sample]."""
     return float(abs(model.response(np.array([np.exp(1j * frequency)]))[0])) ** 2
 
 
 def dot(a: Sequence[float], b: Sequence[float]) -> float:
-    """Inner product of two states: beside so few numbers a call of NumPy takes longer."""
+    """Inner product of two states: for so few numbers faster than NumPy."""
     product: float = sum(map(mul, a, b))
     return product
 
 
 def _agreed(model: StateModel, gain: Gain, length: int) -> tuple[Array, Array]:
-    """(L - 1, n) and (L - 1, L): u that a gain agrees with after it was held.
+    """Maps (L - 1, n) of e and (L - 1, L) of u* to the u that a gain still asks for after a hold.
 
-    Held for j samples from x - x* = e on, u is what u*(k+j) - K (x - x*) asks for then:
+    A u that was held for j samples from x - x* = e on is what u*(k+j) - K (x - x*) asks for if
     (1 + sum_i K A^i B) u = u*(k+j) + sum_i K A^(j-1-i) B u*(k+i) - K A^j e,  i = 0 .. j - 1
     """
     by_state = np.array(gain) @ powers(model.a, np.eye(model.order), length)
     answers = np.append(1.0, by_state @ model.b)[:length]
-    # Without SciPy, which would take a controller 22 MB.
+    # A Toeplitz matrix without SciPy, which would cost a controller 22 MB.
     ago = np.subtract.outer(np.arange(length), np.arange(length))
     by_u = np.tril(answers[np.maximum(ago, 0)])[1:]
     share = by_u.sum(axis=1)
-    count = int(np.cumprod(share > 0.0).sum())  # beyond, it asks for more the more u is
+    count = int(np.cumprod(share > 0.0).sum())  # beyond, a larger u is asked to grow further
     return -by_state[1:count + 1] / share[:count, None], by_u[:count] / share[:count, None]
 
 
@@ -238,19 +238,19 @@ def _plan(model: StateModel, gains: PreviewGains) -> Plan:
     closed[:n, :n] = model.a - np.outer(model.b, gains.state)
     closed[:n, n], closed[n, 0] = -gains.integral * model.b, -model.c
     k = np.append(gains.state, gains.integral)
-    by_state: Array = np.eye(n + 1)  # what makes z
+    by_state: Array = np.eye(n + 1)  # z(k+j), from z(k) and from the references
     by_reference: Array = np.zeros((n + 1, last + 1))
     states, references = np.empty((length, n + 1)), np.empty((length, last + 1))
     for j in range(length):
         preview = np.zeros(last + 1)
         preview[j:] = gains.preview[:last + 1 - j]
-        preview[last] += gains.preview[last + 1 - j:].sum()  # references stay at their last one
+        preview[last] += gains.preview[last + 1 - j:].sum()  # the last reference is held
         states[j], references[j] = -k @ by_state, -k @ by_reference - preview
         by_reference = np.asarray(closed @ by_reference)
         by_reference[:n] -= np.outer(model.b, preview)
         by_reference[n, min(j, last)] += 1.0
         by_state = closed @ by_state
-    # u* and x* for noise of 1 on the references, for their averages.
+    # u* and x* for unit noise on the references, for each width of averaging.
     responses = powers(model.a - np.outer(model.b, gains.state), model.b, HORIZON)
     to_u = np.append(1.0, -responses @ gains.state)
     signals = np.column_stack([to_u, np.vstack([np.zeros(n), responses])])
@@ -260,7 +260,7 @@ def _plan(model: StateModel, gains: PreviewGains) -> Plan:
         of_all = np.array([np.convolve(weights, signal) for signal in signals.T])
         u_noise.append(np.linalg.norm(of_all[0]))
         x_noise.append(of_all[1:] @ of_all[1:].T)
-    # What is ahead rests on references that are not averaged yet as well.
+    # u* ahead also depends on references that are not averaged yet.
     tail = float(np.linalg.norm(references[:, 2 * last // 3:], axis=1).max())
     return Plan(gains, closed, states, references, np.maximum(np.array(u_noise), tail),
                 tuple(x_noise))
@@ -269,9 +269,9 @@ def _plan(model: StateModel, gains: PreviewGains) -> Plan:
 def modulus_margin(
     plant: StateModel, model: StateModel, gains: PreviewGains, factor: float = 1.0,
 ) -> float:
-    """min |1 + L| of the open loop L of feedback around `model` and a plant; 0 if unstable."""
-    # For the worst of observers that do not know that u acts `factor` times as strongly. The gap
-    # itself is left out: it limits what u can do wrong, but not for ever.
+    """Return min |1 + L| of the loop L of feedback for `model` around a plant; 0 if unstable."""
+    # For the worst of four observers, which do not know that u acts `factor` times as strongly. The
+    # gap is left out: it limits the harm that a wrong u does, but not for ever.
     n, least = plant.order, inf
     z = np.exp(1j * np.geomspace(1e-3, np.pi, 120))
     at, response = z[:, None, None], plant.transfer_function.response(z)
@@ -294,7 +294,7 @@ def modulus_margin(
             loop[-1, 0], loop[-1, -1] = -plant.c, 1.0
         if not np.abs(np.linalg.eigvals(loop)).max() < 1.0:
             return 0.0
-        # Opened at u, all of which the observer knows, what comes of q as well.
+        # The loop is opened at u; the observer knows all of u, the part that q adds included.
         closed = believed - np.outer(drive, gain[n:-1])
         closed -= np.outer(correction, seen @ closed)
         by_integral = gains.integral / (z - 1.0)
@@ -307,12 +307,12 @@ def modulus_margin(
 
 @lru_cache(maxsize=16)
 def _observer(model: StateModel, confidence: float) -> tuple[Array, Array, Array, Array] | None:
-    """Transition, input, output and gain of the observer of [x; d]; None where none exists."""
+    """Return A, B, c and the gain of an observer of [x; d], or None if there is none."""
     n = model.order
     a, b, c = np.eye(n + 1), np.append(model.b, 0.0), np.zeros(n + 1)
     a[:n, :n], a[:n, n], c[0] = model.a, model.b, model.c
-    # In units in which one sample of d moves y like its noise does; a trace of noise on x keeps
-    # the equation regular.
+    # With a confidence of 1, one sample of d moves y as much as its noise does; a trace of noise on
+    # x keeps the equation regular.
     drift = 1e-12 * np.eye(n + 1)
     drift[-1, -1] += 1.0
     drift *= confidence / (float(np.linalg.norm(model.b)) * model.c) ** 2
@@ -328,10 +328,10 @@ def _observer(model: StateModel, confidence: float) -> tuple[Array, Array, Array
 
 @lru_cache(maxsize=16)
 def parabolas(preview: int) -> tuple[Array, list[int], list[int]]:
-    """What of 2 H + 1 references is left beside parabolas through the middle 2 w + 1 of them.
+    """Return a matrix from 2 H + 1 references to residuals of parabolas through the middle ones.
 
-    For several widths w <= H, at most a third of the preview, one below the other: shape
-    (sum (2 w + 1), 2 H + 1); then their first rows, and the widths.
+    It stacks blocks of 2 w + 1 rows for several w <= H, at most a third of the preview: shape
+    (sum (2 w + 1), 2 H + 1). Returns as well the first row of each block, and the widths w.
     """
     widths = [w for w in (3, 8, 20) if 3 * w <= preview]
     half, sizes = max(widths, default=0), [2 * w + 1 for w in widths]
@@ -346,7 +346,7 @@ def parabolas(preview: int) -> tuple[Array, list[int], list[int]]:
 
 
 def averages(preview: int) -> Array:
-    """Weights of no average and of that of each width, shape (widths + 1, 2 H + 1)."""
+    """Weights of averaging: first none, then each width of `parabolas`, (widths + 1, 2 H + 1)."""
     fits, first, widths = parabolas(preview)
     kernels = np.zeros((len(widths) + 1, fits.shape[1]))
     kernels[:, fits.shape[1] // 2] = 1.0

@@ -1,13 +1,12 @@
 """Feedback that holds x on the ideal trajectory: K (x_hat - x*) + K_q (q - q*), within bounds.
 
-A deviation that noise explains is left alone. What is beyond is fed back as hard as the estimate of
-the backlash is trusted: the first one may be confidently wrong, which the samples after it
-contradict. So feedback hardens as it holds, and softens while v does not follow.
+A deviation that noise explains is ignored. The gain for a larger one depends on how far the
+estimate of the backlash is trusted, as a first estimate may be confidently wrong until the next
+samples contradict it: the gain rises while the estimate holds, and falls while v does not follow.
 
-While the reference rests v does as little as keeps y where it belongs: feedback through a gap that
-is not known to the last digit would limit-cycle. So v is held while y is within a tolerance of the
-trajectory, and otherwise moves in single steps. Full feedback brings back all that is off; what is
-less it would leave to itself, as noise, until it is far away.
+While the reference rests, continuous feedback through a gap that is not known exactly would
+limit-cycle. So v is held while y is within a tolerance of the trajectory, and otherwise moves in
+single steps. Full feedback is only for y far away: smaller deviations it would ignore as noise.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,33 +25,33 @@ from backlash_ros.core.plant.backlash import GAP, LEFT, RIGHT, Region
 from backlash_ros.core.plant.transfer_function import Array
 
 TRUSTED_AFTER = 40  # samples for which an estimate has to hold before it gets full feedback
-# An estimate this sharp, in relative deviations of slope and gap, counts so many times per sample.
+# A sample with relative deviations of slope and gap below SHARP counts SHARP_COUNTS times.
 SHARP, SHARP_COUNTS = 0.01, 17
-# v is held as long as |x - x*|, the energy of the free response of y over some 50 samples, is
-# within so many standard deviations of the noise on y: 7 stands for an error of its size.
+# v is held while |x - x*|, the root of the energy of the free response of y over some 50 samples,
+# is below so many standard deviations of the noise on y; a constant error y of one of them gives 7.
 TOLERANCE = 21.0
-# The same for the first samples of a rest; later only a drift is worth a step.
+# The same for the first SETTLING samples of a rest; later only a drift is worth a step.
 CLOSE, SETTLING = 7.0, 200
-UNCERTAIN = 5.0  # the same in standard deviations of x, where that is more
-# How often y may be brought back by full feedback, and gently until the tolerance is doubled each
-# time, before it has rested for SETTLING samples.
+UNCERTAIN = 5.0  # least tolerance, in standard deviations of x_hat
+# How often full feedback may bring y back, and how often gentle steps may before each of them
+# doubles the tolerance, until y has stayed within it for SETTLING samples.
 MOST_RETURNS = 2
-ASTRAY = 4.0  # tolerances beyond which y is not led back gently, but with full feedback
-ARRIVED = 0.5  # share of the tolerance within which v comes to rest after that
-OFF = 6.0  # standard deviations of y that mean a deviation while the state is unknown
+ASTRAY = 4.0  # tolerances beyond which full feedback brings y back, instead of gentle steps
+ARRIVED = 0.5  # fraction of the tolerance within which v comes to rest after that
+OFF = 6.0  # standard deviations of y that count as a deviation while x_hat is unknown
 SHORT = 2.0  # standard deviations of the crossing by which v stops short of the u at rest
 
 
 @dataclass
 class Trust:
-    """What was made of the estimates so far."""
+    """How far the estimates are trusted, and the slope and crossings that are inverted."""
 
-    known: bool = False  # whether the newest comes from data of this loop
-    slope: float = nan  # that is inverted
-    crossings: tuple[float, float] = (0.0, 0.0)  # that are inverted, shrunk by their uncertainty
-    held_for: int = 0  # samples for which estimates have held, sharp ones count more often
-    in_use_for: int = 0  # samples since there is one
-    sharp_counts: int = SHARP_COUNTS
+    known: bool = False  # whether the newest estimate was learned, and holds
+    slope: float = nan  # in use by the inverse
+    crossings: tuple[float, float] = (0.0, 0.0)  # the same, shrunk by their uncertainty
+    held_for: int = 0  # samples for which estimates have held; a sharp one counts several times
+    in_use_for: int = 0  # samples since estimates are known
+    sharp_counts: int = SHARP_COUNTS  # how often a sharp one counts
 
     @property
     def full(self) -> bool:
@@ -61,78 +60,78 @@ class Trust:
 
 @dataclass
 class FeedbackState:
-    """What feedback remembers."""
+    """State of the feedback, from sample to sample."""
 
     integral: float = 0.0  # q - q*
-    level: int = 0  # place in the schedule while v does not follow
-    free: int = 0  # samples since it does again
-    bounded: bool = False  # whether feedback met its bound the sample before
-    width: float = 1.0  # bound in scales while the backlash is unknown
+    level: int = 0  # index into the schedule, which rises while v does not follow
+    free: int = 0  # samples since v follows again
+    bounded: bool = False  # whether feedback met its bound at the sample before
+    width: float = 1.0  # bound while the backlash is unknown, in multiples of its scale
     asked: float = 0.0  # largest |u*| so far
-    blind_for: int = 1  # samples from now on in which x_hat cannot be known
+    blind_for: int = 1  # coming samples in which x_hat cannot be known yet
 
 
 @dataclass
 class DeviationNoise:
-    """How much of x_hat - x* may be noise: of y, of x_hat, and of the references that make x*."""
+    """How much of x_hat - x* noise explains: of y, of x_hat, and of the references behind x*."""
 
-    u_std: list[float]  # of K (x_hat - x*) for each gain, at least K times half the noise of y
+    u_std: list[float]  # of K (x_hat - x*) for each gain, at least |K| times half the noise of y
     x_std: float = 0.0  # of |x_hat|
-    x_known: bool = False  # whether the covariance of x_hat is
-    ignored: float = 0.0  # |x_hat - x*| that is left alone
-    tolerated: float = 0.0  # |x_hat - x*| that is worth no crossing
+    x_known: bool = False  # whether the covariance of x_hat is known
+    ignored: float = 0.0  # |x_hat - x*| that is not fed back
+    tolerated: float = 0.0  # |x_hat - x*| that is not worth a crossing of the gap
 
 
 class StateFeedback:
-    """Gains of a design, used as far as the estimate is trusted; shrinkage: see Tracking.
+    """State feedback, as hard as the estimate can be trusted; shrinkage: see Tracking.
 
-    While nothing is known the acquisition gain replaces K, and the trajectory excites the backlash.
+    Until an estimate is known, the acquisition gain replaces K, and the trajectory excites the gap.
     """
 
     def __init__(self, design: TrackingDesign, shrinkage: float, noise_std: float) -> None:
         self.trust, self.state = Trust(), FeedbackState()
         self.shrinkage, self.y_std = shrinkage, noise_std
         self._newest: Estimate | None = None
-        self.gap_u = 0.0  # that the gap takes
+        self.gap_u = 0.0  # m (c_r - c_l)
         self.use(design)
 
     def use(self, design: TrackingDesign) -> None:
-        """Use these gains."""
+        """Use the gains of this design."""
         self._design = design
         self._least = 0.5 * self.y_std * np.array([hypot(*gain) for gain in design.schedule])
         self.noise = DeviationNoise(self._least.tolist())
-        # Places in the schedule: of the gain that its noise asks for, and of the one in use.
+        # Indices into the schedule: of the hardest gain that noise allows, and of the one in use.
         self._quiet = self._in_use = 0
 
     def restart(self) -> None:
-        """Go on from the softest, as x_hat begins anew, full of noise."""
+        """Begin with the softest gain again, as x_hat starts anew and is noisy."""
         self.trust, self._newest = Trust(sharp_counts=1), None
         self.state = replace(self.state, width=1.0, asked=0.0, bounded=False,
                              blind_for=self._design.model.order)
 
     def take(self, estimate: Estimate, ideal: float, first: bool) -> bool:
-        """Take in estimate and u* of this sample; returns whether the estimate is another one."""
+        """Take in estimate and u* of this sample; return whether the estimate has changed."""
         trust, status, gap = self.trust, estimate.status, estimate.c_r - estimate.c_l
         another, self._newest = estimate is not self._newest, estimate
         if another:
-            # What was learned before a restart says nothing yet about the state of G. A law without
-            # deviations says by its status alone that it has learned, and holds that later.
+            # While it is acquiring, as after a restart, a learned estimate is not yet confirmed. A
+            # law without deviations has learned once it was tracking, whatever comes after.
             trust.known = status not in (Status.ACQUIRING, Status.INCONSISTENT) and (
                 trust.known or estimate.learned or status is Status.TRACKING)
             trust.crossings = shrunk_crossings(estimate, self.shrinkage, trust.known)
-            # On the way to its first agreement with the data the m of such a law may be anywhere.
+            # Before such a law first agrees with the data, its m may be anywhere.
             if isnan(trust.slope) or estimate.learned or status is Status.TRACKING:
                 trust.slope = estimate.m
         self.state.asked, self.gap_u = max(self.state.asked, abs(ideal)), estimate.m * gap
         if not (trust.known and estimate.learned):
-            # Without deviations nobody knows how far it may be relied on.
+            # Without standard deviations there is no telling how far to rely on an estimate.
             trust.held_for = trust.in_use_for = 0
             return another
         trust.in_use_for += 1
-        if first:  # of this loop: it was known before
+        if first:  # the estimate was known before this loop began
             trust.held_for = TRUSTED_AFTER
         elif not trust.full:
-            # Beside far larger u even a gap that is hardly known makes little difference.
+            # Where u moves much further than the gap, a poorly known gap matters little.
             large = max(gap, self.state.width * max(self.state.asked, self.gap_u) / estimate.m)
             sharp = (estimate.std_m < SHARP * estimate.m
                      and estimate.std_c_r + estimate.std_c_l < SHARP * large)
@@ -142,7 +141,7 @@ class StateFeedback:
     def prepare(
         self, x_cov: Array | None, y_std: float, x_noise: Array, reference_std: float,
     ) -> None:
-        """Choose the gain that noise allows; x_noise: covariance of x* for noise of 1 in r."""
+        """Choose the gain that noise allows; x_noise: covariance of x* for unit noise on r."""
         noise, deviation_std = self.noise, 0.0
         noise.x_known = x_cov is not None
         if x_cov is not None:
@@ -151,29 +150,29 @@ class StateFeedback:
             stds = np.sqrt(np.maximum(of_both, 0.0))
             noise.x_std = max(of_x_hat.item(-1), 0.0)**0.5
             noise.u_std, deviation_std = np.maximum(stds[:-1], self._least).tolist(), stds.item(-1)
-        # By as much v may rest off: one rule for motion and rest.
+        # As much as v may leave uncorrected at rest: the same rule for motion and rest.
         noise.ignored = ARRIVED * max(CLOSE * y_std, UNCERTAIN * noise.x_std)
-        # What noise of the references moves and v did not follow shows as a deviation as well.
+        # Noise of the references moves x*; where v did not follow, that shows as a deviation, too.
         noise.tolerated = max(noise.ignored, ARRIVED * UNCERTAIN * deviation_std)
-        # As hard as leaves what feedback makes of noise below a tenth of the u that the gap takes.
+        # The hardest gain with which noise moves u by no more than a tenth of m (c_r - c_l).
         most = 0.1 * self.gap_u or inf
         self._quiet = next((i for i, std in enumerate(noise.u_std) if std <= most),
                            len(noise.u_std) - 1)
 
     def deviation(self, x_hat: Sequence[float] | Array, x: Sequence[float]) -> list[float]:
-        """x_hat - x*; 0 while x_hat cannot be known."""
+        """Return x_hat - x*, or zeros while x_hat cannot be known."""
         if self.state.blind_for:
             self.state.blind_for -= 1
             return [0.0] * len(x)
         return [float(x_hat[i]) - each for i, each in enumerate(x)]
 
     def u(self, error: Sequence[float], held_back: bool, largest: float) -> tuple[float, float]:
-        """What is taken from u* for an error of x, and what of it is worth a crossing of the gap.
+        """Return the feedback to subtract from u*, and how much of it is worth crossing the gap.
 
-        held_back: whether v met its limits, or is on its way across the gap. largest: |x*| so far.
+        error: x_hat - x*. held_back: whether v met its limits, or is crossing the gap. largest: the
+        largest |x*| so far.
         """
-        # Per sample, of the bound while the backlash is unknown; samples without a limit after
-        # which feedback takes a step back to full.
+        # Growth per sample of the bound while the backlash is unknown; free samples per step up.
         widening, stiffen_after = 1.03, 20
         state, trust, most, noise = self.state, self.trust, self.bounds[0], self.noise
         if trust.held_for:
@@ -184,8 +183,8 @@ class StateFeedback:
                 state.free += 1
                 if state.level > 0 and state.free % stiffen_after == 0:
                     state.level -= 1
-            # K, or the less of it the longer v does not follow, and the newer the estimate. Far
-            # away, beyond what x* has been and noise explains, it does not matter what noise does.
+            # K, or a softer gain while v does not follow or the estimate is new. Further away than
+            # x* ever was, and than noise explains, what the gain makes of noise does not matter.
             astray = off > max(largest, ASTRAY / ARRIVED * noise.ignored)
             unproven = SOFTEST - trust.held_for * (SOFTEST + 1) // TRUSTED_AFTER
             self._in_use = max(state.level, unproven, 0 if astray else self._quiet)
@@ -196,7 +195,7 @@ class StateFeedback:
         else:
             feedback = worth = dot(self._design.acquisition or (), error)
             if not -most < feedback < most:
-                # A gap wider than the first guess has to be crossed some day.
+                # A gap wider than the first guess has to be crossed eventually.
                 state.width = min(widening * state.width, LARGEST_IN_ACQUISITION)
         if trust.full:
             by_integral = self._design.feedback.integral * state.integral
@@ -207,20 +206,20 @@ class StateFeedback:
         return min(max(feedback, -most), most), min(max(worth, -most), most)
 
     def pull_back(self, deviation: Sequence[float]) -> float:
-        """u - u* that brings y back gently."""
+        """Return the u - u* that brings y back gently."""
         pull, most = -dot(self._design.gentle, deviation), self.bounds[0]
         return 0.0 if isnan(pull) else min(max(pull, -most), most)
 
     def furthest(
         self, deviation: Sequence[float], ahead: Sequence[float], side: Region, turns_in: int,
     ) -> float:
-        """The furthest u that v can hold and never be asked to come back from until u* turns."""
+        """Return the furthest u that, if held, feedback will not ask back before u* turns."""
         by_state, by_u = self._design.holding[self._in_use]
         agreed = side * (by_state @ deviation + by_u @ ahead)[:turns_in]
         return side * float(agreed.min(initial=inf))
 
     def integrate(self, difference: float, limited: bool) -> None:
-        """Take in y* - y; a saturated actuator cannot follow: going on would only wind up."""
+        """Integrate y* - y, except while v or feedback is saturated (anti-windup)."""
         if not self.trust.full:
             self.state.integral = 0.0
         elif not (limited or self.state.bounded):
@@ -233,31 +232,31 @@ class StateFeedback:
 
     @property
     def noise_u(self) -> float:
-        """Standard deviation of what feedback makes of noise."""
+        """Standard deviation of the feedback that noise causes."""
         return self.noise.u_std[self._quiet]
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """Largest feedback, and largest |u_d - u*| whatever makes u_d."""
+        """Bound of the feedback, and bound of |u_d - u*| whatever makes u_d."""
         scale = max(self.state.asked, self.gap_u)
         if not self.trust.held_for:
-            # A wrong slope may make the loop unstable, which bounded feedback slows down.
+            # A wrong slope may destabilise the loop; bounded feedback slows its growth down.
             return self.state.width * scale, LARGEST_IN_ACQUISITION * scale
-        # No error of y that would not matter at rest calls for too much; |K| is what it calls for.
+        # A deviation that is tolerated at rest must never meet the bound.
         by_noise = TOLERANCE * self.y_std * hypot(*self._design.schedule[0])
         most = LARGEST_FEEDBACK * max(scale, by_noise)
         return most, most
 
 
 class Mode(Enum):
-    """What v does."""
+    """How v moves at present."""
 
     FOLLOW = auto()  # the trajectory moves
     RETURN = auto()  # y is far away: full feedback brings it back
-    # To the u that holds G at rest, short of it by what is uncertain about the crossing. What is
-    # left of u shows in y; once it is known v goes on in the same direction, which crosses no gap.
+    # v steps to the u that holds G at rest, but short of it by the uncertainty of the crossing. The
+    # error that remains shows in y, and is removed later in the same direction: no gap to cross.
     HOLD = auto()
-    LEAD_BACK = auto()  # to a u that brings y back into the tolerance, then to rest again
+    LEAD_BACK = auto()  # v steps to a u that brings y back into the tolerance, then to rest again
 
     @property
     def steps(self) -> bool:
@@ -267,33 +266,33 @@ class Mode(Enum):
 
 @dataclass
 class Rest:
-    """Decides whether v rests, and steps it there."""
+    """Decides whether v rests, and makes its single steps."""
 
     mode: Mode = Mode.HOLD
-    target: tuple[float, float] = (0.0, 0.0)  # u_d where v rests, deviations to shrink its crossing
-    side: Region = GAP  # newest line
-    largest: float = 0.0  # |x*| so far
+    target: tuple[float, float] = (0.0, 0.0)  # u_d where v rests, and shrinkage of its crossing
+    side: Region = GAP  # line in use at the sample before
+    largest: float = 0.0  # largest |x*| so far
     limit: float = 0.0  # tolerance in use
-    rested: int = 0  # samples for which the trajectory has
-    returns: int = 0  # how often y was brought back since by full feedback
-    leads: int = 0  # and gently
-    turns: int = 0  # of v in this return
-    near: int = 0  # samples since y was last away
-    pull: float = 0.0  # u - u* with which leading back began
+    rested: int = 0  # samples for which the trajectory has rested
+    returns: int = 0  # how often full feedback has brought y back meanwhile
+    leads: int = 0  # how often gentle steps have
+    turns: int = 0  # of v since full feedback began
+    near: int = 0  # samples for which y has been within the tolerance
+    pull: float = 0.0  # u - u* with which LEAD_BACK began
 
     def decide(
         self, y: float, noise_std: float, plan: IdealTrajectory, deviation: Sequence[float],
         x_std: float | None, side: Region, pull_back: Callable[[Sequence[float]], float],
         acts: bool,
     ) -> Mode:
-        """Set the mode for this sample.
+        """Set and return the mode for this sample.
 
-        x_std: of x_hat, None where it is unknown. side: line in use. pull_back: u - u* that brings
-        y back gently. acts: whether feedback asks for more than noise.
+        x_std: of |x_hat|, None if unknown. side: line in use. pull_back: gives the u - u* that
+        brings y back gently. acts: whether feedback is larger than its noise.
         """
         self.largest = max(self.largest, hypot(*plan.x))
-        least = 1e-5 * self.largest  # tolerance, where that is more
-        still = 0.004 * max(TOLERANCE * noise_std, least)  # by which x* may move per sample
+        least = 1e-5 * self.largest  # smallest tolerance
+        still = 0.004 * max(TOLERANCE * noise_std, least)  # motion of x* per sample within a rest
         if plan.spread > noise_std or (self.mode is Mode.FOLLOW and plan.moved > still):
             self.mode, self.rested, self.returns, self.leads = Mode.FOLLOW, 0, 0, 0
         elif x_std is None:
@@ -302,7 +301,7 @@ class Rest:
         else:
             self.rested += 1
             width = CLOSE if self.rested < SETTLING else TOLERANCE
-            # Where y left again each time, the constants do not tell how to come closer.
+            # If y has left again each time, the estimate is too poor to hold it closer.
             width *= 2.0 ** min(max(self.leads - MOST_RETURNS, 0), 10)
             self.limit = max(width * noise_std, least, UNCERTAIN * x_std)
             if self.mode is Mode.RETURN and side is not self.side:
@@ -313,8 +312,8 @@ class Rest:
         return self.mode
 
     def _mode_at_rest(self, size: float, order: int, pull: float, acts: bool) -> Mode:
-        # Crossing the gap takes time. Full feedback that turns again and again overshoots by that;
-        # it is due again when y has stayed where it belongs for a while, and is pushed away.
+        # Crossing the gap takes time, so that full feedback that keeps turning overshoots. After
+        # MOST_RETURNS it is allowed again only once y has stayed within the tolerance for a while.
         self.near = self.near + 1 if size <= self.limit else 0
         if self.near >= SETTLING:
             self.returns = self.leads = 0
@@ -326,7 +325,7 @@ class Rest:
                     self.turns, self.returns = 0, self.returns + 1
                 return Mode.RETURN
         if self.mode is Mode.LEAD_BACK:
-            # As long as it pulls the same way, and a quarter as hard, or y is not yet near.
+            # While the pull keeps its direction and, once y is near, a quarter of its strength.
             least = 0.25 if size <= ARRIVED * self.limit else 0.0
             return Mode.LEAD_BACK if pull * self.pull > least * self.pull**2 else Mode.HOLD
         if size <= self.limit:
@@ -338,19 +337,19 @@ class Rest:
         self, estimate: Estimate, plan: IdealTrajectory, pull: float, inverse: BacklashInverse,
         begins: bool,
     ) -> None:
-        """Aim v at where it is to rest, where that is better than to stay."""
+        """Aim v at the u of this mode, if that is enough of an improvement over staying."""
         if inverse.taking_up or inverse.side is GAP:
-            return  # still on its way, or nobody knows what u is
+            return  # still on its way, or the real u is not known yet
         ideal, engaged = plan.u, estimate.c_l if inverse.side is LEFT else estimate.c_r
         u = estimate.m * (inverse.v - engaged)
         if self.mode is Mode.LEAD_BACK:
             if not begins and (u - ideal) * pull >= 0.5 * pull * pull:
-                return  # strong enough to bring y back
+                return  # the u that is held is strong enough to bring y back
             u_d, shrinkage = ideal + pull, 0.0
         else:
             side_std = estimate.std_c_r if ideal > u else estimate.std_c_l
             away, uncertain = abs(ideal - u), SHORT * side_std * estimate.m
-            # A step has to move x by a share of the tolerance, and to lessen what u is off.
+            # A step has to move x by a fraction of the tolerance, and to reduce the error of u.
             if not (away * plan.design.push > 0.25 * self.limit
                     and away > max(1.5 * uncertain, plan.noise_band)):
                 return
@@ -360,14 +359,14 @@ class Rest:
 
 
 def shrunk_crossings(estimate: Estimate, deviations: float, known: bool) -> tuple[float, float]:
-    """Crossings shrunk towards each other by their uncertainty; both 0 while nothing is known.
+    """Return the crossings drawn together by so many of their standard deviations.
 
-    Over-compensation drives past the gap and starts a limit cycle, under-compensation only leaves
-    a rest of the backlash: in a loop around y the smaller gap is the safe one.
+    Without standard deviations they are 0 until `known`. In a loop around y the smaller gap is the
+    safe one: over-compensation starts a limit cycle, under-compensation leaves some backlash.
     """
     if deviations == 0.0:
         return estimate.c_r, estimate.c_l
-    if isnan(estimate.std_c_r):  # a law that knows no uncertainty
+    if isnan(estimate.std_c_r):  # a first guess, or a law that knows no uncertainty
         return (estimate.c_r, estimate.c_l) if known else (0.0, 0.0)
     middle = 0.5 * (estimate.c_r + estimate.c_l)
     return (max(estimate.c_r - deviations * estimate.std_c_r, middle),

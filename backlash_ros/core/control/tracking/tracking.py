@@ -18,26 +18,26 @@ from backlash_ros.core.plant.backlash import GAP, LEFT, RIGHT, Region
 from backlash_ros.core.plant.numerics import NoiseLevel
 from backlash_ros.core.plant.transfer_function import Array, StateModel
 
-FADING = 0.8  # per sample, of what is handed over
+FADING = 0.8  # per sample, of HandOver.added
 
 
 @dataclass
 class HandOver:
-    """Whoever takes over v, and whatever it takes it over with, v goes on from where it is."""
+    """Bumpless transfer: with new gains, or after an interruption, v continues from where it is."""
 
-    # By which what v stands for differs from the u_d that would have led to it: added to u_d.
+    # Added to u_d, and fading: the u_d that v stands for, minus `due`.
     added: float = 0.0
-    due: float | None = None  # that u_d, where somebody takes over with the next sample
-    widens: bool = False  # whether what is added may lead u_d further than feedback may
-    leading: bool = False  # whether the reference may have gone on while nobody followed it
+    due: float | None = None  # the u_d that the loop asks for when v is handed over to it
+    widens: bool = False  # whether `added` may lead u_d further from u* than feedback may
+    leading: bool = False  # whether the reference may have moved on during an interruption
 
 
 class Tracking(ControlStructure):
     """u_d = u* - K (x - x*) - K_q (q - q*) around the ideal trajectory u*, x*, q* of G alone.
 
-    The trajectory is what the LQ preview controller does without backlash, for y_m delayed by the
-    preview window, before which it is the output at the start. Where it rests, v moves in single
-    steps. shrinkage: standard deviations by which the crossings are shrunk. noise_std: of y.
+    The trajectory is that of the LQ preview controller without backlash, for y_m delayed by the
+    preview window, which is filled with the first output. While it rests, v moves in single steps.
+    shrinkage: standard deviations by which the crossings are shrunk. noise_std: of y.
     """
 
     def __init__(
@@ -50,17 +50,17 @@ class Tracking(ControlStructure):
         self.feedback = StateFeedback(beginning, shrinkage, noise_std)
         self.rest, self.hand_over = Rest(), HandOver()
         self._noise_std, self._y_noise = noise_std, NoiseLevel()
-        self._moves = deque([0.0], maxlen=100)  # by which v moved of late, as sizes
+        self._moves = deque([0.0], maxlen=100)  # sizes of the newest moves of v
         self._engaged_for = 0  # samples since v has crossed the gap
-        # y, the covariance of x_hat and who knows both, of a command that the next one was not
-        # prepared after.
+        # y, the covariance of x_hat and its source at the newest command, until `prepare` takes
+        # them.
         self._newest: tuple[float, Array | None, Law] | None = None
 
     @property
     def may_change(self) -> bool:
         """Whether v neither crosses the gap nor is about to."""
-        # Samples after the first estimate, by then v has crossed the gap with it; after a crossing,
-        # by then its last moves are over; in which u* must not turn or move v more than of late.
+        # Samples after the first estimate, until v has crossed the gap with it; after a crossing,
+        # until its last moves are over; ahead, in which u* must not turn or move v more than of late.
         settled_after, engaged_after, foreseen = 150, 5, 6
         trust, plan = self.feedback.trust, self.trajectory
         if trust.in_use_for < settled_after or self._engaged_for < engaged_after:
@@ -89,7 +89,7 @@ class Tracking(ControlStructure):
         return partial(better_design, model, self._weights, self.trajectory.design)
 
     def adopt(self, gains: object, source: Law) -> None:
-        """Go on with a design as if it had been in use for as long as references are kept."""
+        """Switch to a design as if it had been in use since the oldest reference that is kept."""
         assert isinstance(gains, TrackingDesign)
         self.prepare()
         self.trajectory.use(gains, self.trajectory.softness)
@@ -98,7 +98,7 @@ class Tracking(ControlStructure):
         self._change_trajectory(source)
 
     def _change_trajectory(self, source: Law) -> None:
-        """Be where the trajectory in use would be, and let v go on from where it is."""
+        """Replay the trajectory with the plan now in use, and hand v over without a jump."""
         trajectory, feedback = self.trajectory, self.feedback
         if trajectory.references.empty:
             return
@@ -106,7 +106,7 @@ class Tracking(ControlStructure):
         state = replace(feedback.state)
         deviation = feedback.deviation(source.x_hat, trajectory.x)
         due = trajectory.u - feedback.u(deviation, False, self.rest.largest)[0]
-        feedback.state = state  # this was no sample
+        feedback.state = state  # undo what feedback.u changed: no sample has passed
         self.hand_over = HandOver(due=due, widens=True, leading=self.hand_over.leading)
         trajectory.advance()  # the plant is at the next sample when the next command is made
 
@@ -119,7 +119,7 @@ class Tracking(ControlStructure):
         plan, feedback, rest, hand_over = self.trajectory, self.feedback, self.rest, self.hand_over
         first, x_cov = plan.references.empty, source.x_cov
         if first:
-            # What may be noise is no distance to go: a loop at rest stays at rest.
+            # If y differs from y_m by noise only, begin at y_m: a loop at rest stays at rest.
             plan.begin(y_m if abs(y - y_m) <= OFF * self._noise_std else y)
         elif hand_over.leading:
             plan.lead_to(y_m)
@@ -127,7 +127,7 @@ class Tracking(ControlStructure):
         plan.take(y_m)
         follows = not (rest.mode.steps or inverse.taking_up)
         if feedback.take(estimate, plan.u, first) and follows and hand_over.due is None:
-            hand_over.due = inverse.extreme  # that led to v with the estimate before
+            hand_over.due = inverse.extreme  # the u_d that led to v with the previous estimate
         if hand_over.due is not None:
             stands_for = inverse.resume(feedback.trust.slope, *feedback.trust.crossings)
             if inverse.side is not GAP:
@@ -156,7 +156,7 @@ class Tracking(ControlStructure):
         if steps and x_cov is not None:
             rest.step(estimate, plan, feedback.pull_back(deviation), inverse, mode is not before)
         side = self._side(turned, u_d, noise, inverse)
-        # Whatever makes u_d: nothing leads it further from what the reference asks for.
+        # However u_d was made, it stays this close to what the reference asks for.
         reach = feedback.bounds[1] + (abs(added) if hand_over.widens else 0.0)
         u_d = min(max(rest.target[0] if steps else u_d, plan.u - reach), plan.u + reach)
         side_before, v_before, trust = inverse.side, inverse.v, feedback.trust
@@ -173,7 +173,7 @@ class Tracking(ControlStructure):
         return u_d
 
     def prepare(self) -> None:
-        """Go on to the next sample, if that is still to be done."""
+        """Prepare the next sample, unless that has been done already."""
         if self._newest is not None:
             y, x_cov, source = self._newest
             self._newest = None
@@ -188,10 +188,10 @@ class Tracking(ControlStructure):
         self, wanted: float, worth: float, noise: float, deviation: Sequence[float],
         inverse: BacklashInverse,
     ) -> float:
-        """Return u_d: the u that is wanted where that costs no crossing, else what is worth one."""
-        # What is behind the u that is held makes v cross the gap; what is beyond the furthest u*
-        # comes back across it, and has to be more than noise. What is not must not go further than
-        # feedback agrees with either, but for what hands v over.
+        """Return u_d: `wanted` as far as that costs no crossing of the gap, else `worth`."""
+        # A u behind the one that is held makes v cross the gap. One beyond the furthest u* has to
+        # come back across it, so it must be more than noise. Otherwise u goes no further than
+        # feedback will agree with until u* turns, except while v is handed over.
         plan, side, (c_r, c_l) = self.trajectory, inverse.side, self.feedback.trust.crossings
         if side is GAP or side is not plan.turning.side or c_r == c_l:
             return worth
@@ -205,21 +205,21 @@ class Tracking(ControlStructure):
         return min(max(wanted * side, least), most) * side
 
     def _side(self, turned: bool, u_d: float, noise: float, inverse: BacklashInverse) -> Region:
-        """Return the side of the gap for u_d; turned: whether that of u* is new.
+        """Return the side of the gap for u_d; turned: whether the side of u* has changed.
 
-        The trajectory has no noise and is known ahead, so it decides. Feedback may ask for the
-        other side as well, where y is pushed, by more than the noise in u_d.
+        The trajectory decides, as it is free of noise and known ahead. Feedback may ask for the
+        other side as well if y is pushed, by more than the noise in u_d.
         """
         plan, side, (c_r, c_l) = self.trajectory, inverse.side, self.feedback.trust.crossings
         asked = plan.turning.side
         if c_r == c_l and asked is not GAP and u_d != inverse.held_u:
-            return RIGHT if u_d > inverse.held_u else LEFT  # nothing is crossed
+            return RIGHT if u_d > inverse.held_u else LEFT  # there is no gap to cross
         if asked is GAP or side is GAP:
             return asked
         back = (inverse.held_u - u_d) * side
         if turned:
-            # Limits may have kept v so far behind that u still has to go on.
+            # Limits may have kept v so far behind that u still has to move on in its direction.
             return asked if side is asked or back > -(noise + plan.back) else side
-        # Where feedback turned before the trajectory does, that is no reason to turn again.
+        # If feedback turned before the trajectory, the old side of u* is no reason to turn back.
         band = plan.back + (noise if side is asked else 0.0)
         return Region(-side) if back > max(band, inverse.direction_band) else side

@@ -2,8 +2,8 @@
 
     u*(k) = -K x*(k) - K_q q*(k) - sum f_j r(k+j),   x*(k+1) = A x* + B u*,   q*(k+1) = q* + r - y*
 
-A turn of u* is seen before it comes. That decides on which side v is: once per turn, however noisy
-feedback is.
+A turn of u* is foreseen, and decides when v changes sides: once per turn, however noisy feedback
+is.
 """
 
 from dataclasses import dataclass
@@ -16,22 +16,22 @@ from backlash_ros.core.plant.backlash import GAP, RIGHT, Region
 from backlash_ros.core.plant.numerics import NoiseLevel
 from backlash_ros.core.plant.transfer_function import Array, powers
 
-QUIET = 0.02  # share of the u that the gap takes, by which noise of the references may move u*
+QUIET = 0.02  # fraction of m (c_r - c_l) by which noise of the references may move u*
 
 
 class ReferenceWindow:
-    """r(k) .. r(k + N) without the noise of y_m, and `history` references before them; preview: N.
+    """r(k) .. r(k + N), smoothed against noise of y_m, and `history` older ones; preview: N.
 
-    Each is replaced by the middle of a parabola through those around it, as many as are one but for
-    the noise; the newest N / 3 stay. noise_gains: deviation of u* for noise of 1 that was averaged
-    so, shape (widths,). u_noise_std: largest deviation of u* by what is left of the noise.
+    Each is replaced by the middle of a parabola through as many neighbours as fit one within their
+    noise; the newest, up to N / 3, stay. noise_gains: std of u* for unit noise, unsmoothed and for
+    each width, shape (widths + 1,). u_noise_std: largest std of u* by the noise that is left.
     """
 
     def __init__(self, preview: int, history: int, noise_gains: Array) -> None:
         self.noise_gains = noise_gains
         self._preview, self._kept = preview, history + preview + 1
-        # As they came, as they are used, and what u* makes of noise of 1 in them. Written from the
-        # left to the right; when they are full their end moves to the front.
+        # References as they came, as they are used, and std of u* for unit noise in them. Filled
+        # from left to right; once the rows are full, the newest columns move to the front.
         self._rows: Array = np.zeros((3, 2 * self._kept))
         self._end = 0
         self.noise = NoiseLevel()  # of the references as they came
@@ -48,20 +48,20 @@ class ReferenceWindow:
         return self._rows[1, self._end - self._preview - 1:self._end]
 
     def all(self) -> Array:
-        """Everything that is kept, the newest last, shape (up to history + N + 1,)."""
+        """All references that are kept, the newest last, shape (up to history + N + 1,)."""
         return self._rows[1, max(0, self._end - self._kept):self._end]
 
     def fill(self, value: float) -> None:
-        """Let the window begin with this value everywhere."""
+        """Fill the window with this value."""
         self._end = self._preview + 1
         self._rows[:2, :self._end] = value
         self._rows[2, :self._end] = 0.0
 
     def lead_to(self, value: float) -> None:
-        """Bend the window so that it leads to a value that is not what would have come next."""
+        """Bend the window so that it ends at a value that would be a jump from its end."""
         window = self.window
         jump = value - float(window[-1])
-        # What has become of the reference in between is not known; a jump would be taken for one.
+        # How the reference got there is not known; an unbent window would show a jump.
         if self._preview and abs(jump) > float(np.abs(np.diff(window)).max()):
             self._rows[:2, self._end - len(window):self._end] += np.linspace(0.0, jump, len(window))
 
@@ -71,7 +71,7 @@ class ReferenceWindow:
         self._end += 1
 
     def settle(self) -> None:
-        """Make of the newest reference what only the next sample needs."""
+        """Smooth the references and measure their noise, for the next sample."""
         newest, half = self._end - 1, max(parabolas(self._preview)[2], default=0)
         self._rows[0, newest] = self._rows[1, newest]
         self._rows[2, newest] = self.noise_gains[0]
@@ -82,7 +82,7 @@ class ReferenceWindow:
         window = self.window
         self.low, self.high = float(window.min()), float(window.max())
         if std > 0.0:
-            self.noise_spread = 8.0 * std  # by as much it parts low and high at most
+            self.noise_spread = 8.0 * std  # the most that it adds to high - low
             first = self._end - self._preview - 1
             self.u_noise_gain = float(self._rows[2, first:max(self._end - half, first + 1)].max())
             self.u_noise_std = std * self.u_noise_gain
@@ -91,12 +91,12 @@ class ReferenceWindow:
             self._end = self._kept
 
     def _average(self, at: int) -> None:
-        # Mean square of what is left beside a parabola, in those of the noise, up to which the
-        # references are taken for one, and from which on not: at a step, or a sharp turn.
+        # Mean square residual of a parabola, in variances of the noise, up to which it is used in
+        # full, and from which on it is not used: there is a step, or a sharp turn.
         one, none = 1.8, 3.0
         fits, first, widths = parabolas(self._preview)
         rest = fits @ self._rows[0, at - widths[-1]:at + widths[-1] + 1]
-        of_noise = rest / self.noise.std  # its square may be too small for a number
+        of_noise = rest / self.noise.std  # the square of the rest itself might underflow
         squares = np.add.reduceat(of_noise * of_noise, first).tolist()
         reference = value = self._rows.item(0, at)
         gain = float(self.noise_gains[0])
@@ -113,17 +113,17 @@ class Turning:
     """On which side u* moves, and where it turns."""
 
     side: Region = GAP  # on which u* moves
-    decided: int = 0  # samples for which it stays
-    extreme: float = nan  # furthest u* on it
+    decided: int = 0  # coming samples in which the side cannot change
+    extreme: float = nan  # furthest u* on that side so far
     furthest: float = nan  # u* to which u goes without turning
-    turns_in: int = 0  # samples until u* turns, or all that are known ahead
+    turns_in: int = 0  # samples until u* turns; len(ahead) if it does not turn within these
 
 
 class IdealTrajectory:
-    """Follows the references, a sample at a time: `take`, `turn`, `prepare` for the next one.
+    """Trajectory of G for the references; at each sample call `take`, `turn`, then `prepare`.
 
-    x, q: x* (n,) and q*. ahead: u* from this sample on, shape (L,). moved: by how much x* did.
-    spread: of the references, beyond their noise.
+    x, q: x* (n,) and q*. ahead: u* from this sample on, shape (L,). moved: distance from the x* of
+    the sample before. spread: range of the references in the window, beyond their noise.
     """
 
     def __init__(self, design: TrackingDesign) -> None:
@@ -140,39 +140,39 @@ class IdealTrajectory:
 
     @property
     def aim(self) -> float:
-        """u* of this sample, or what it comes back to without having turned."""
+        """u* of this sample, or Turning.furthest if u* goes beyond that without a turn to come."""
         side, furthest = self.turning.side, self.turning.furthest
         return furthest if side is not GAP and (self.u - furthest) * side > 0.0 else self.u
 
     @property
     def back(self) -> float:
-        """By how much u* has come back without having turned."""
+        """By how much u* has come back from its extreme without having turned."""
         return max((self.turning.extreme - self.u) * self.turning.side, 0.0)
 
     @property
     def noise_band(self) -> float:
-        """How far noise of the references may turn u*."""
-        # The highest of many samples before a turn is some three deviations above.
+        """How far u* may come back by noise of the references alone."""
+        # The extreme of many samples before a turn is some three standard deviations too far out.
         return 6.0 * self.references.u_noise_std
 
     def use(self, design: TrackingDesign, softness: int = 0) -> None:
-        """Be this one of the trajectories of a design from the next sample on."""
+        """Use this plan of a design from the next sample on; softness: its index."""
         self.design, self.softness, self._plan = design, softness, design.plans[softness]
         self.references.noise_gains = self._plan.noise_gains
-        self._due: Array | None = None  # u* ahead at the next sample, but for its reference
+        self._due: Array | None = None  # u* ahead at the next sample, without its reference
         self._transition: list[tuple[list[float], float]] = list(
             zip(design.model.a.tolist(), design.model.b.tolist(), strict=True))
 
     def soften(self, gap_u: float) -> bool:
-        """Weigh u as noise of the references demands for a gap of this u; say if that is new."""
-        # What each plan makes of noise that is averaged over the widest parabola.
+        """Choose the plan by the noise of the references beside gap_u; return if it changed."""
+        # Std of u* by each plan for unit noise that is smoothed by the widest parabola.
         of_noise = [plan.noise_gains.item(-1) for plan in self.design.plans]
         now, noise_std = self.softness, self.references.noise.std
         most = QUIET * gap_u / noise_std if noise_std > 0.0 else inf
         if gap_u == 0.0:
             return False
-        # Another one has to win a factor of two: how large the noise is, is known no better. What
-        # softer ones leave is the reference itself.
+        # A change has to gain a factor of two, as the noise is known no better, and softer plans
+        # follow the reference less closely.
         if of_noise[now] > most:
             other = next((i for i, gain in enumerate(of_noise) if gain <= most),
                          of_noise.index(min(of_noise)))
@@ -185,7 +185,7 @@ class IdealTrajectory:
         return True
 
     def replay(self) -> None:
-        """Be where this design would be, from rest at the oldest reference that is kept on."""
+        """Set x*, q* and u* as if this design had been in use since the oldest reference kept."""
         plan, model = self._plan, self.design.model
         # z(k+1) = F z(k) + [B; 0] u_p + [0; 1] r with u_p = -sum f_j r(k+j).
         n, references = model.order, self.references.all()
@@ -201,18 +201,18 @@ class IdealTrajectory:
         self.ahead = self._ahead(self.references.window).tolist()
 
     def begin(self, r: float) -> None:
-        """Rest at y = r."""
+        """Begin at rest with y = r."""
         self.references.fill(r)
         self._due = None
         self.x = (self.design.model.equilibrium * r).tolist()
 
     def lead_to(self, y_m: float) -> None:
-        """Let the references lead to one that is not what would have come next."""
+        """Bend the references so that they lead to y_m without a jump."""
         self.references.lead_to(y_m)
         self._due = None
 
     def take(self, y_m: float) -> None:
-        """Take in r(k + N), so that u* is known for this sample and those ahead."""
+        """Take in y_m as r(k + N), and compute u* for this sample and those ahead."""
         references, r, gains = self.references, float(y_m), self._plan.references[:, -1]
         due = self._ahead(references.window[1:]) if self._due is None else self._due
         references.append(r)
@@ -220,10 +220,10 @@ class IdealTrajectory:
         self.ahead = (due + gains * r).tolist()
 
     def turn(self, noise_std: float, gap_u: float, band: float, crossing: float) -> bool:
-        """Decide on which side v is to be at this sample; returns whether it is another one.
+        """Decide on which side v is to be at this sample; return whether the side has changed.
 
-        noise_std: of y. gap_u: u that the gap takes. band: of u*, see `_turn`. crossing: samples
-        that v takes across the gap; it leaves as much before the turn as it arrives after it.
+        noise_std: of y. gap_u: m (c_r - c_l). band: of u*, see `_turn`. crossing: samples that v
+        takes to cross the gap; it leaves as long before the turn as it arrives after it.
         """
         ahead, turning, before = self.ahead, self.turning, self.turning.side
         taken, turns_in = ceil(crossing), 0
@@ -254,31 +254,31 @@ class IdealTrajectory:
         turning.furthest = most(ahead)
         if turning.turns_in == len(ahead) \
                 and least_of(ahead[ahead.index(turning.furthest):]) != ahead[-1]:
-            # A swing that is no turn, and over: it is not followed there and back.
+            # A swing that is no turn and is over within `ahead` is not followed there and back.
             turning.furthest = ahead[-1]
         return turning.side is not before
 
     @property
     def noise(self) -> tuple[Array, float]:
-        """Covariance of x* for noise of 1 in references averaged as these are, and their noise."""
+        """Covariance of x* for unit noise on references smoothed like these, std of their noise."""
         by_width = np.abs(self._plan.noise_gains - self.references.u_noise_gain)
         return self._plan.x_noise[int(by_width.argmin())], self.references.noise.std
 
     def advance(self) -> None:
-        """Go on to the next sample."""
+        """Advance x* and q* to the next sample."""
         before = self.x
         self.q += self.references.window.item(0) - self.design.model.c * before[0]
         self.x = [dot(row, before) + b * self.u for row, b in self._transition]
         self.moved = dist(self.x, before)
 
     def prepare(self) -> None:
-        """Do what the next sample needs, and its reference does not change."""
+        """Advance to the next sample, and compute all that does not depend on its reference."""
         self.advance()
         self.references.settle()
         self._due = self._ahead(self.references.window[1:])
 
     def _ahead(self, references: Array) -> Array:
-        """u* from [x*; q*] and these references on, as many as there are."""
+        """Return u* for this sample and those ahead, by [x*; q*] and these references."""
         gains = self._plan.references[:, :len(references)]
         ahead: Array = self._plan.states @ [*self.x, self.q] + gains @ references
         return ahead
@@ -287,10 +287,10 @@ class IdealTrajectory:
 def _turn(
     ahead: list[float], extreme: float, side: Region, noise: float, band: float, shortest: int,
 ) -> int | None:
-    """Where u* is furthest before it turns: samples from now on, -1 where that was before; or None.
+    """Return in how many samples u* is furthest before it turns (-1: it was already), or None.
 
-    It turns where it comes back by more than noise, and by more than the band as well, or for as
-    long as references are known; for more than the shortest time.
+    It turns if it comes back by more than noise, and then either by more than the band, later than
+    `shortest` samples after its extreme, or until the end of `ahead`.
     """
     peak, furthest_back, turned = -1, 0.0, False
     for j, u in enumerate(ahead):
