@@ -1,4 +1,4 @@
-"""What explains a record best: a backlash found from nothing, and whether it counts as known."""
+"""Finds the backlash that explains a record best, and judges whether it counts as known."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ from backlash_ros.core.window import Window
 
 @dataclass(frozen=True)
 class Setup:
-    """What is known before the first sample, and what counts as known after some."""
+    """What is assumed before the first sample, and the criteria by which a fit counts as known."""
 
     family: PlantFamily
-    noise_std: float  # of y, nominal
+    noise_std: float  # nominal standard deviation of the noise on y
     bounds: Bounds
-    widest: float  # gap that is considered
+    widest: float  # largest gap considered
     guess: float  # gap of the first guess
-    walk_std: float  # of u per square root of a sample
-    drift: Array  # of m, c_r, c_l, as well (3,)
+    walk_std: float  # standard deviation by which u walks, per square root of a sample
+    drift: Array  # the same for m, c_r, c_l (3,)
 
     def problem(self, record: Window, older: Prior | None = None) -> Problem:
         return Problem(self.family, record.v, record.y, self.noise_std, older)
 
     def is_known(self, f: WindowFit, turns: int | None = None) -> bool:
-        """Whether m and the gap are known well enough to be published, and within their bounds."""
+        """Whether m and the gap are known well enough to be published, and lie within bounds."""
         return self.is_precise(f, turns) and not self.outside_bounds(f)
 
     def is_precise(self, f: WindowFit, turns: int | None = None) -> bool:
-        """The same, whatever the bounds are; turns: reversals, None for those of its record."""
+        """The same, regardless of the bounds. turns: reversals seen; None: those of its record."""
         enough = (f.left.turns if turns is None else turns) >= self.turns_needed
         return f.valid and enough and not self.moves_unexplained(f) and \
             self.are_precise(f.crossings, f.crossings_cov, f.systematic)
@@ -52,7 +52,7 @@ class Setup:
 
     def are_precise(self, crossings: Array, cov: Array, systematic: bool) -> bool:
         """Whether m, c_r, c_l (3,) of this covariance (3, 3) are known well enough."""
-        # What makes residuals systematic does not average out.
+        # Systematic errors do not average out.
         factor = 1.0 / settings.BY_CHANCE if systematic else 1.0
         m, c_r, c_l = map(float, crossings)
         std_m, *std = map(float, np.sqrt(np.maximum(np.diag(cov), 0.0)))
@@ -63,19 +63,19 @@ class Setup:
         return std_m < factor * settings.STD_SLOPE * m and (gap_known or no_gap)
 
     def moves_unexplained(self, f: WindowFit) -> bool:
-        """Whether y moves by more than is tolerated in a way that no G makes, if G is uncertain."""
+        """Whether correlated residuals exceed what is tolerated; never if G is taken for exact."""
         return f.systematic and f.unexplained > settings.NEGLIGIBLE and self.family.count > 0
 
     def moves_against(self, f: WindowFit) -> bool:
-        """Whether y moves against v, by a slope that is possible."""
+        """Whether y moves against v: m is negative, with a size within the bounds of m."""
         return self.bounds.m[0] <= -f.m <= self.bounds.m[1]
 
     def noisier(self, f: WindowFit) -> bool:
-        """Whether readings are off by more than their nominal noise, or their step, makes them."""
+        """Whether readings are noisier than nominal noise or quantization makes them."""
         return f.noise > settings.AS_GOOD * max(self.noise_std, f.step / sqrt(12.0))
 
     def outside_bounds(self, f: WindowFit) -> list[OutOfBounds]:
-        """What of m, c_r, c_l lies outside of its bounds by more than chance."""
+        """Those of m, c_r, c_l that lie outside their bounds by more than chance."""
         values = f.crossings
         apart = np.abs(values - self.bounds.project(*values.tolist()))
         outside = apart > settings.BY_CHANCE * f.crossings_std + 1e-9 * np.abs(values)
@@ -87,21 +87,21 @@ def afresh(
     setup: Setup, record: Window, like: WindowFit | None = None, older: Prior | None = None,
     also: WindowFit | None = None, walks: bool = False,
 ) -> WindowFit | None:
-    """The best fit from nothing, mixed with other gaps that fit about as well; None for none.
+    """The best fit of a search over all gaps, with the spread of others as good; None if none fits.
 
-    like: with about this G. also: where to begin as well. walks: whether u may walk.
+    like: fit whose G the search starts from. also: a further starting point. walks: try walks of u.
     """
     family, swing, first = setup.family, float(np.ptp(record.v)), float(record.v[0])
     if np.isfinite(record.y).sum() < 15 + 2 * family.count or not swing:
         return None
     p = setup.problem(record, older)
-    # The noise of a first step is at least a twentieth of the motion of y.
+    # In the first step the noise is taken to be at least a twentieth of the motion of y.
     noise = max(setup.noise_std, 0.05 * float(np.nanstd(record.y)))
     xi = np.zeros(family.count) if like is None else like.theta[3:]
-    # Where v has not turned often enough for any gap, what is found is hardly ever used.
+    # If v has not reversed often enough whatever the gap, the fit will hardly be used: be brief.
     hopeless = record.turns(0.01 * swing, first) < setup.turns_needed
-    fits, candidates = list[WindowFit](), 1 if hopeless else 3  # gaps that are fitted
-    for _ in range(1 if hopeless else 2):  # once more around another G, as the best fit has it
+    fits, candidates = list[WindowFit](), 1 if hopeless else 3  # number of gaps to fit
+    for _ in range(1 if hopeless else 2):  # the second time around the G of the best fit
         found, null = search(family, record.v, record.y, setup.noise_std, setup.widest, xi)
         if not found or (not fits and found[0].evidence < null + settings.ENGAGED):
             break
@@ -139,12 +139,12 @@ def afresh(
 
 
 def mixed(p: Problem, best: WindowFit, others: Sequence[WindowFit] = ()) -> WindowFit:
-    """The likeliest of these fits, and of those along the gap, with the spread of the mixture."""
+    """The likeliest of these fits and of others along the gap, with the spread of the mixture."""
     wider, beyond = _along_the_gap(p, best)
     fits = [f for f in (best, *others, *beyond) if f.valid]
     alike_read = [f for f in fits if bool(f.step) == bool(best.step)]
     likeliest = max(alike_read, key=lambda f: f.evidence, default=best)
-    if likeliest.evidence > best.evidence + 0.5:  # else it is the same, but for rounding
+    if likeliest.evidence > best.evidence + 0.5:  # else it is the same optimum
         return mixed(p, likeliest, fits)
     share = np.exp([f.evidence - best.evidence for f in fits])
     for each, f in zip(share / max(float(share.sum()), 1e-300), fits, strict=True):
@@ -153,15 +153,16 @@ def mixed(p: Problem, best: WindowFit, others: Sequence[WindowFit] = ()) -> Wind
 
 
 def apart(one: WindowFit, other: WindowFit) -> Array:
-    """What m, c_r, c_l of one spread around those of the other (3, 3)."""
+    """Outer product (3, 3) of the differences between two fits in m, c_r, c_l."""
     by = one.crossings - other.crossings
     return np.asarray(np.outer(by, by))
 
 
 def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]:
-    """What readings leave open along the gap, all else fitted (3, 3), and fits that lie beyond.
+    """Follow the profile likelihood of the gap, r standard deviations to either side.
 
-    r deviations from the best they should be less likely by r^2 / 2; half of that tells another.
+    Returns the covariance of m, c_r, c_l (3, 3) beyond that of a normal posterior, which would fall
+    by r^2 / 2, and the fits of other optima, met where it falls by less than half of that.
     """
     out, beyond = np.zeros((3, 3)), list[WindowFit]()
     if not (best.valid and best.gap > 0.0 and best.cov[2, 2] > 0.0):
@@ -179,7 +180,7 @@ def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]
             if not there.m > 0.0:
                 break
             behind = max(likeliest - value, 1.0)
-            if nearer <= 2.0:  # the furthest that is likely may lie well before this one
+            if nearer <= 2.0:  # else the last likely gap may lie far short of this one
                 more = max(0.5 / behind - reach**-2, 0.0) * apart(there, best)
                 wider = max(wider, more, key=np.trace)
             beside = there if behind < 0.25 * reach**2 else None
@@ -195,18 +196,17 @@ def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]
 def _with_gap(
     p: Problem, near: WindowFit, gap: float, weights: Array, normal: float, close: float,
 ) -> tuple[float, WindowFit]:
-    """The log-posterior and the likeliest fit with this gap, from one with a gap near it.
+    """The highest log-posterior with this gap, and its fit, starting from a fit near it.
 
-    normal: what a normal posterior would have; so close to it, after many reversals, no other
-    beginning is tried.
+    Other p0 are tried too, unless it is `close` to that of a `normal` posterior, with many turns.
     """
     v, best, theta = float(p.v[0]), (-inf, near), near.theta.copy()
     theta[2] = gap
-    # The beginning may bar the way to another gap: from both of its ends as well, if it is open.
+    # p0 may block the way to another gap: if it is unknown, also start from both of its ends.
     ends = [(0.0, True), (1.0, True)] * isnan(p.older.v)
     for share, begun in [((near.p0 - v) / near.gap, False), *ends]:
         f, value = replace(near, p0=v + share * gap, theta=theta), -inf
-        with suppress(np.linalg.LinAlgError):  # so far away that y is no number
+        with suppress(np.linalg.LinAlgError):  # y overflows so far away
             for _ in range(FIRST_STEPS):
                 f, before = p.step(f, held=True, begun=begun), value
                 value = p.log_posterior(f, weights)

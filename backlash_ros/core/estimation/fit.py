@@ -1,10 +1,10 @@
-"""The fit of all unknowns to a record: Gauss-Newton steps with exact derivatives, each one QR.
+"""Fits all unknowns to a record by Gauss-Newton steps with exact derivatives, one QR per step.
 
     y = G(z; xi) [m p(v; g, p0) - o + d] + X / A(z; xi) + e,   o = m c_r,   xi ~ N(0, s^2)
 
-X: state before the record. d: disturbance that walks to 0 at its end. p0, g: beginning and gap of
-the play. The noise and the scale s are integrated out in closed form (Normal-Gamma) over a grid of
-s, whose prior is log-normal around 1: G is about as wrong as configured.
+X: state of G before the record. p0, g: play output before it, and gap. d: disturbance of u, a walk
+that ends at 0. The noise is integrated out in closed form (Normal-Gamma), the scale s over a grid;
+the prior of s is log-normal around 1: G is expected to be about as wrong as configured.
 """
 
 from dataclasses import replace
@@ -22,13 +22,13 @@ from backlash_ros.core.plant.backlash import Region, engaged, play, reversals
 from backlash_ros.core.plant.numerics import lfilter, padded, shifted
 from backlash_ros.core.plant.transfer_function import Array
 
-STEPS, FIRST_STEPS, FEW_STEPS = 16, 6, 3  # of Gauss-Newton, at most
+STEPS, FIRST_STEPS, FEW_STEPS = 16, 6, 3  # limits on the number of Gauss-Newton steps
 
 
 class Run(NamedTuple):
-    """A record by the values of a fit: G as b / a; p, u, y (N,).
+    """A record simulated with the values of a fit: G = b / a; play output p, then u and y, (N,).
 
-    error: of the readings (N,), 0 where y was lost. weights, number: as `independence` has them.
+    error: readings minus y (N,), 0 where lost. weights, number: see `posterior.independence`.
     """
 
     b: list[float]
@@ -43,9 +43,9 @@ class Run(NamedTuple):
 
 
 class Problem:
-    """A record v, y (N,), y nan where lost, with what is known beside it.
+    """A record to be fitted: v and y (N,), y nan where lost, and what is known beforehand.
 
-    noise_std: nominal, a weak prior. step: of the readings, None to be told from them.
+    noise_std: nominal, a weak prior. step: quantization of y, 0 for none; None to detect it.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class Problem:
         self._newest: dict[WindowFit, Run] = {}
 
     def at(self, f: WindowFit) -> Run:
-        """The record by the values of this fit."""
+        """The record simulated with the values of this fit; the last three results are kept."""
         if f not in self._newest:
             p = play(self.v, max(f.gap, 0.0), f.p0)
             hats, knots, _ = self._walk_of(f)
@@ -69,32 +69,32 @@ class Problem:
             y = lfilter(b, a, u, padded(f.x, len(a) - 1))
             error = (self.y - y) * self.known
             weights, number = posterior.independence(self.y, self.known, y, self.step_of_readings)
-            told = posterior.likelihood(error, f.noise_std, f.step, weights)
-            run = Run(b, a, p, u, y, error, told, weights, number)
+            likelihood = posterior.likelihood(error, f.noise_std, f.step, weights)
+            run = Run(b, a, p, u, y, error, likelihood, weights, number)
             self._newest = dict([*self._newest.items(), (f, run)][-3:])
         return self._newest[f]
 
     def residual(self, f: WindowFit) -> Array:
-        """Of y (N,), nan where it was lost."""
+        """Readings minus the simulated output (N,), nan where y was lost."""
         return np.where(self.known, self.at(f).error, np.nan)
 
     @cached_property
     def _walk(self) -> Array:
-        """d by each of its knots, 8 samples apart or more, and 0 at the end (W, N)."""
+        """Basis of d: hat functions (W, N), knots some 8 samples apart or more, 0 at the end."""
         count = len(self.v)
         knots = min(max(count // 8, 1), 36)
         place = np.arange(count) * knots / max(count - 1, 1)
         return np.asarray(np.maximum(1.0 - np.abs(place - np.arange(knots)[:, None]), 0.0))
 
     def _walk_of(self, f: WindowFit) -> tuple[Array, Array, float]:
-        """The same where u walks, values of the knots, and deviation of their differences."""
+        """Hats, knot values, standard deviation of their differences; no hats unless u walks."""
         if not f.walk_std:
             return np.zeros((0, len(self.v))), np.zeros(0), 1.0
         knots = f.knots if len(f.knots) == len(self._walk) else np.zeros(len(self._walk))
         return self._walk, knots, f.walk_std * sqrt(len(self.v) / len(self._walk))
 
     def log_posterior(self, f: WindowFit, w: Array) -> float:
-        """Of these values, where readings have these weights (N,); -inf where it is no number."""
+        """Log-posterior up to a constant; w: weights of the readings (N,). -inf if not finite."""
         leak, xi = f.theta[3:3 + self.family.leaks], f.theta[3 + self.family.leaks:]
         with np.errstate(all='ignore'):
             run = self.at(f)
@@ -114,18 +114,18 @@ class Problem:
     def step(
         self, f: WindowFit, most_scale: float = inf, held: bool = False, begun: bool = False,
     ) -> WindowFit:
-        """The values that the linearization around f makes likeliest, with their posterior.
+        """One Gauss-Newton step: mean and covariance of the posterior of the model linearized at f.
 
-        held, begun: whether the gap, or the beginning, stays. Raises LinAlgError for no numbers.
+        most_scale: limit of s. held, begun: keep the gap, or p0. Raises LinAlgError if not finite.
         """
         from scipy.linalg.lapack import dtrtri  # where fits are made: 31 MB
 
         r, run = self._triangle(f, held, begun), self.at(f)
         if not np.isfinite(r).all():
             raise np.linalg.LinAlgError('the samples leave no finite posterior')
-        # eta, all but the error of G, is R11^-1 (d1 - R12 xi) + R11^-1 noise.
-        size, k = len(r) - 1, self.family.count - self.family.leaks  # a leak is one of the first
-        n, order, at = size - k, len(run.a) - 1, size - self.family.count - 3  # at: place of m
+        # eta, all unknowns but the error of G, is R11^-1 (d1 - R12 xi) + R11^-1 noise.
+        size, k = len(r) - 1, self.family.count - self.family.leaks  # a leak is part of eta
+        n, order, at = size - k, len(run.a) - 1, size - self.family.count - 3  # at: index of m
         diagonal = np.abs(np.diag(r))[:n]
         of_eta, of_xi = np.zeros((size, n)), np.eye(size, k, -n)
         of_eta[:n] = dtrtri(r[:n, :n])[0] if diagonal.min() > 0.0 else np.linalg.pinv(r[:n, :n])
@@ -136,7 +136,7 @@ class Problem:
             f, r[n:, n:], squares, freedom, most_scale)
         beta = of_eta @ r[:n, -1] + of_xi @ xi
         swing, first = float(np.ptp(self.v)), float(self.v[0])
-        # With no gap at all, neither side would be told.
+        # With a gap of exactly 0, both sides would be engaged at once.
         beta[at + 2] = gap = min(max(beta[at + 2], 1e-9 * swing), 2.0 * swing)
         p0 = float(beta[at - 1])
         cov = noise * of_eta @ of_eta.T + of_xi @ cov_xi @ of_xi.T
@@ -148,7 +148,7 @@ class Problem:
             scale=scale, cov=cov[at:, at:], volume=volume - len(knots) * log(knot_std))
 
     def remembered(self, f: WindowFit) -> Prior:
-        """What the record and what is known beside it say of theta, but for the prior of xi."""
+        """What this record and older samples say of theta, without the prior N(0, s^2) of xi."""
         r = self._triangle(f, False, False)
         at = len(r) - 4 - self.family.count
         return Prior(r[at:-1, at:-1], r[at:-1, -1])
@@ -160,36 +160,36 @@ class Problem:
         return np.asarray(np.triu(dgeqrf(rows, overwrite_a=1)[0][:rows.shape[1]]))
 
     def rows(self, f: WindowFit, held: bool = False, begun: bool = False) -> Array:
-        """Least squares of a step: samples, what is known beside; target last (N + B, P + 1)."""
-        vague = 100.0  # prior deviation of the state before a record, over the largest reading
-        tight = 1e6  # weight of what is held
+        """Least-squares rows of a step: N samples, B priors; target last, (N + B, P + 1)."""
+        vague = 100.0  # prior standard deviation of X, over the largest reading
+        tight = 1e6  # weight by which an unknown keeps its value
         run, jacobian, first = self.at(f), self.jacobian(f), self.v[0]
         _, score, information = run.likelihood
         (_, knots, knot_std), x = self._walk_of(f), padded(f.x, len(run.a) - 1)
         beta = np.concatenate([x, knots, [f.p0], f.theta])
         of_samples = np.vstack([jacobian.T, jacobian @ beta + score / information])
         of_samples *= np.sqrt(information * run.weights)
-        at = len(x) + len(knots) + 1  # place of m
+        at = len(x) + len(knots) + 1  # index of m
         *unit, target = np.eye(len(beta) + 1)
         p0, gap, older = unit[at - 1], unit[at + 2], self.older
         begin = sqrt(12.0) / max(f.gap, 1e-9) * (p0 + (first + 0.5 * f.gap) * target) \
             if isnan(older.v) else tight * (p0 - older.left * gap + older.v * target)
         beside = [
-            # The gap is within the swing; p0 is anywhere within the gap of now.
+            # Weak priors: a gap of the size of the swing of v, p0 anywhere in the present gap.
             tight * (gap + f.gap * target) if held else gap / max(float(np.ptp(self.v)), 1e-300),
             tight * (p0 + f.p0 * target) if begun else begin,
             *unit[at + 3:at + 3 + self.family.leaks],
-            # What no reading tells, as where the first were lost, would grow without bounds.
+            # Keeps X finite where no reading determines it, as when the first ones were lost.
             *(row / (vague * max(float(np.abs(self.y).max()), 1e-300)) for row in unit[:len(x)]),
             *-np.diff([*unit[len(x):at - 1], 0.0 * target], axis=0) / knot_std,
             *np.column_stack([np.zeros((len(older.rows), at)), older.rows, older.values])]
         return np.hstack([of_samples, np.array(beside).T]).T
 
     def jacobian(self, f: WindowFit) -> Array:
-        """Derivatives of y by X, knots, p0, m, o, g, xi: (N, P)."""
+        """Derivatives of the simulated y by X, knots, p0, m, o, g and xi, in this order: (N, P)."""
         run, count = self.at(f), len(self.v)
         side = engaged(self.v, run.p, max(f.gap, 0.0))
-        # A side that has not moved p yet leaves it where it began.
+        # Until p first moves it is p0, whichever side is engaged.
         side[:int(np.argmax(np.append(run.p != f.p0, True)))] = Region.GAP
         over_a = lfilter([1.0], run.a, np.vstack([
             self._walk_of(f)[0], f.m * (side == Region.GAP), run.p, np.full(count, -1.0),
@@ -200,25 +200,25 @@ class Problem:
             sensitivities(self.family, f.xi, u, y)]).T
 
     def fitted(self, f: WindowFit, steps: int = STEPS, least_gain: float = 0.0) -> WindowFit:
-        """Gauss-Newton steps from f until they move nothing, halved where they go too far."""
-        # The first of them, over which an error of G with a scale is no larger than configured.
+        """Iterate Gauss-Newton steps from f until they converge or gain less than `least_gain`."""
+        # Number of first steps in which s is at most 1: G no more wrong than configured.
         far_steps = 4 * (self.family.count > self.family.leaks)
-        # Deviations of the gap that a step may still move it by; least_gain: of the log-likelihood.
+        # A gap that moves by fewer standard deviations has converged, unless 1 nat is still gained.
         least_move = 0.02 if steps > FEW_STEPS else 0.2
         for k in range(steps):
             weights = self.at(f).weights
             best = self.log_posterior(f, weights)
-            # Far from the optimum the error of the linearization passes for one of G.
+            # Far from the optimum, errors of the linearization would be taken for errors of G.
             most = 1.0 if k < far_steps < steps else inf
             new, there, value = self._stepped(f, best, weights, most, False, False)
             if not value > best - 0.5:
-                # A kink where the play began, or a gap that is open, bars the way to all else.
+                # A kink at p0, or an undetermined gap, may block all others: hold either of them.
                 for held in (False, True):
                     _, beside, of_it = self._stepped(f, best, weights, most, held, not held)
                     if of_it > value:
                         there = replace(beside, cov=new.cov, scale=new.scale, volume=new.volume)
                         value = of_it
-            if not value > best - 50.0:  # f stands: only its posterior is new, and its noise
+            if not value > best - 50.0:  # f stays: only its posterior and noise are new
                 f = replace(f, cov=new.cov, scale=new.scale, volume=new.volume)
                 again = f if f.step else self._with_noise(f)
                 if again.noise_std > 0.9 * f.noise_std:
@@ -240,7 +240,7 @@ class Problem:
         there = self._towards(f, new)
         value = self.log_posterior(there, w)
         if -inf < value <= best - 0.5:
-            # Beyond a kink of the play, where another side was engaged, it may be better.
+            # Beyond a kink, where the other side is engaged, a second step may succeed.
             again = self._towards(there, self.step(there, most_scale, held, begun))
             of_again = self.log_posterior(again, w)
             if of_again > best:
@@ -254,7 +254,7 @@ class Problem:
 
     def _towards(self, f: WindowFit, new: WindowFit, share: float = 1.0) -> WindowFit:
         furthest = float(np.abs(new.theta[3:] - f.theta[3:]).max(initial=0.0))
-        length = share * (2.0 / max(furthest, 2.0))  # of G two prior deviations at once, at most
+        length = share * (2.0 / max(furthest, 2.0))  # xi: two prior deviations a step, at most
         order, knots = max(len(f.x), len(new.x)), self._walk_of(f)[1]
         old, x = padded(f.x, order), padded(new.x, order)
         return replace(
@@ -262,26 +262,26 @@ class Problem:
             p0=f.p0 + length * (new.p0 - f.p0), theta=f.theta + length * (new.theta - f.theta))
 
     def _with_noise(self, f: WindowFit) -> WindowFit:
-        """The same with the noise that its residuals have."""
+        """This fit with the noise_std that its residuals show."""
         run = self.at(f)
         free = max(float(run.weights.sum()) - len(f.x) - len(f.knots) - 4.0, 0.0)
         squares = (run.weights * run.error) @ run.error + self.nominal**2
         out = replace(f, noise_std=sqrt(squares / (free + 1.0)))
-        told = posterior.likelihood(run.error, out.noise_std, 0.0, run.weights)
-        self._newest[out] = run._replace(likelihood=told)
+        likelihood = posterior.likelihood(run.error, out.noise_std, 0.0, run.weights)
+        self._newest[out] = run._replace(likelihood=likelihood)
         return out
 
     def finished(self, f: WindowFit) -> WindowFit:
-        """The same with what it leaves."""
+        """This fit with `left`, the statistics of its residuals and reversals, filled in."""
         run, known = self.at(f), self.known
         w, count = run.weights, float(run.weights.sum())
         density, score, information = run.likelihood
-        e = np.bincount(run.number, (score * w)[known])  # of what counts as one reading
+        e = np.bincount(run.number, (score * w)[known])  # one score per independent reading
         squares = max(float(e @ e), 1e-300)
         rho = max(float(e[lag:] @ e[:-lag]) / squares for lag in (1, 2, 4, 8) if lag < len(e))
-        dispersion = squares / max(float(w @ information), 1e-300)  # below 1 rho may be anything
+        dispersion = squares / max(float(w @ information), 1e-300)  # below 1, rho is unreliable
         rho = max(rho - 3.0 / sqrt(max(count, 1.0)), 0.0) * min(dispersion, 1.0)
-        # In such units that a reading more or less makes no fit the likelier one.
+        # Scaled so that merely counting more or fewer readings makes no fit likelier.
         value = float(w @ density) + count * log(self.step_of_readings or self.nominal)
         turns = len(reversals(engaged(self.v, run.p, max(f.gap, 0.0))))
         rms = sqrt(float(run.error @ run.error) / max(int(known.sum()), 1))
@@ -289,7 +289,7 @@ class Problem:
             value, rms, rho, dispersion if f.step else 1.0, count, turns))
 
     def begun(self, f: WindowFit, offset: bool = False) -> WindowFit:
-        """The same with the state before the record, and o where `offset`, at their best."""
+        """This fit with X, and o too if `offset`, from linear least squares; all else is held."""
         there = replace(f, x=np.zeros(1))
         run, of_o = self.at(there), -2 - self.family.count
         unknown = [*range(len(run.a) - 1), *[of_o] * offset]
@@ -300,9 +300,9 @@ class Problem:
         return replace(f, x=best[:len(run.a) - 1], theta=theta)
 
     def with_intervals(self, f: WindowFit) -> WindowFit:
-        """The finished fit, by intervals where the noise does not hide the step of readings."""
-        # The noise beside it is the likeliest of a grid, but as large as leaves a reading near an
-        # edge of its interval for every unknown: fewer are no normal posterior.
+        """The finished fit, by the interval likelihood unless noise hides the quantization."""
+        # noise_std is the likeliest of a grid, but large enough that there is a reading near an
+        # edge of its interval for every unknown: with fewer, the posterior would not be normal.
         step, unknowns = self.step_of_readings, len(f.x) + len(f.knots) + 1 + len(f.theta)
         largest = 0.25 * step
         edges = unknowns / max(float(self.at(f).weights.sum()), 1.0)

@@ -1,7 +1,7 @@
-"""What a reading of y says of the output, and what a fit of many has found.
+"""The likelihood of readings of y, and the result of a fit: values, posterior, evidence.
 
-One reading is normal around the output. With a step delta it says that the output, blurred by noise
-of deviation sigma, lies within half a step of it (L. Y. Wang, G. G. Yin, J.-F. Zhang, Y. Zhao,
+A reading is normally distributed around the output. If it is quantized with step delta, it says
+that output plus noise (standard deviation sigma) lies within half a step of it (L. Y. Wang et al.,
 System Identification with Quantized Observations, Birkhaeuser 2010):
 
     P(y | output) = [Phi((r + delta/2) / sigma) - Phi((r - delta/2) / sigma)] / delta
@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from backlash_ros.core.estimation.settings import CHANCE
 from backlash_ros.core.plant.transfer_function import Array
 
-SCALES = np.asarray(np.geomspace(3e-4, 10.0, 14), np.float64)  # of the error of G that are weighed
+SCALES = np.asarray(np.geomspace(3e-4, 10.0, 14), np.float64)  # grid of s
 
 
 class Likelihood(NamedTuple):
-    """Of each reading (N,): log of its density, its derivative by the output, and information."""
+    """For each reading (N,): log-density, its derivative by the output, and information on that."""
 
     log_density: Array
     score: Array
@@ -32,27 +32,27 @@ class Likelihood(NamedTuple):
 
 
 def step_of(y: Array) -> float:
-    """The step of which all distances between readings (N,) are multiples; 0 for none."""
-    even = 1e-3  # share of a step by which distances may be off a whole number of them
+    """The quantization step, of which all differences of readings (N,) are multiples; 0 if none."""
+    even = 1e-3  # tolerance of that, in steps
     different = np.unique(y[np.isfinite(y)])
-    if len(different) < 8:  # different ones that tell a step
+    if len(different) < 8:  # distinct readings needed to tell a step
         return 0.0
     apart = np.diff(different)
-    apart = apart[apart > even * np.median(apart)]  # one reading may be rounded in two ways
+    apart = apart[apart > even * np.median(apart)]  # not floating-point errors
     steps = apart / apart.min()
     return float(apart.min()) if abs(steps - np.round(steps)).max() < even else 0.0
 
 
 def likelihood(r: Array, noise_std: float, step: float, weights: Array) -> Likelihood:
-    """What readings, weighted (N,), say of outputs that are off by r (N,); step 0: none."""
+    """Likelihood of readings with residuals r and weights, both (N,); step 0: not quantized."""
     if not step:
         return Likelihood(
             -0.5 * (r / noise_std) ** 2 - log(sqrt(2.0 * pi) * noise_std), r / noise_std**2,
             np.full(len(r), noise_std**-2))
     half = 0.5 * step / noise_std
     probability, score, curvature = _of_interval(r / noise_std, half)
-    # What says nothing, deep within its interval, would leave unknowns open. Their sum stays.
-    total = weights @ curvature + 1e-9  # of a reading, where none says anything
+    # Every reading gets at least the mean information, lest unknowns stay open; the sum is kept.
+    total = weights @ curvature + 1e-9  # positive even if no reading says anything
     information = np.maximum(curvature, total / (weights.sum() + 1e-9))
     information *= total / (weights @ information + 1e-9)
     return Likelihood(probability - log(step), score / noise_std, information / noise_std**2)
@@ -62,7 +62,7 @@ def _of_interval(r: Array, half: float) -> tuple[Array, Array, Array]:
     from scipy.special import log_ndtr  # where fits are made: 31 MB
 
     upper, lower = r + half, r - half
-    # Of both tails the smaller one: the difference of two numbers near 1 would be rounding.
+    # From the smaller tail: a difference of two numbers near 1 would be lost to rounding.
     more, less = log_ndtr(half - np.abs(r)), log_ndtr(-half - np.abs(r))
     probability = more + np.log(-np.expm1(np.minimum(less - more, -1e-300)))
     at_upper, at_lower = (
@@ -74,17 +74,17 @@ def _of_interval(r: Array, half: float) -> tuple[Array, Array, Array]:
 def independence(
     y: Array, known: NDArray[np.bool_], output: Array, step: float,
 ) -> tuple[Array, NDArray[np.intp]]:
-    """Share (N,) of an independent reading that each is, and which one the known are (K,)."""
-    # Readings that are equal wherever the output stands still, or moves as it did before, repeat
-    # one rounding; where they are not, those in a row do.
-    same_place = 16  # parts of a step within which an output counts as the same
+    """Weights (N,) that count repeated readings once, and the group of each known reading (K,)."""
+    # If the output passes a place in the same way again with the same reading, quantization errors
+    # repeat. If readings there differ, only equal ones in a row repeat an error.
+    same_place = 16  # parts of a step; outputs within one part are at the same place
     weights = known.astype(np.float64)
     if not step or not known.any():
         return weights, np.arange(int(weights.sum()))
     read, places = y[known], np.floor(output[known] * (same_place / step))
     row = np.cumsum(np.append(0, (np.diff(read) != 0.0) | (np.diff(places) != 0.0)))
     moves = np.diff(places, prepend=places[:1], append=places[-1:])
-    # No two ways have the same sum of irrational multiples.
+    # A way: a place, the moves to and from it. Irrational weights make its sum unique.
     _, first, way = np.unique(places + sqrt(2.0) * moves[:-1] + sqrt(3.0) * moves[1:],
                               return_index=True, return_inverse=True)
     differ = np.bincount(way, np.abs(read - read[first[way]])) > 0.5 * step
@@ -94,40 +94,40 @@ def independence(
 
 
 class Prior(NamedTuple):
-    """What older samples say: R theta = d + noise of deviation 1, shapes (r, 3 + K), (r,)."""
+    """What older samples say: rows theta = values + white noise of standard deviation 1."""
 
-    rows: Array
-    values: Array
-    v: float = nan  # at the last engagement, nan where it is unknown
-    left: bool = False  # whether that was on the left side
+    rows: Array  # (r, 3 + K)
+    values: Array  # (r,)
+    v: float = nan  # at the last engagement, nan if unknown
+    left: bool = False  # whether the left side was engaged then
 
 
 class Left(NamedTuple):
-    """What a fit leaves: of its residuals, or of the engaged side in the record."""
+    """Statistics of a finished fit: of its residuals, and of the play in the record."""
 
-    likelihood: float = -inf  # log
-    rms: float = inf
-    correlation: float = 0.0
+    likelihood: float = -inf  # log-likelihood
+    rms: float = inf  # of the residuals
+    correlation: float = 0.0  # of the residuals, beyond chance
     dispersion: float = 1.0  # mean square of the scores of intervals, over their information
-    readings: float = 0.0  # independent ones
-    turns: int = 0  # reversals
+    readings: float = 0.0  # number of independent readings
+    turns: int = 0  # reversals of the play
 
 
 @dataclass(frozen=True, eq=False)
 class WindowFit:
-    """Values of all unknowns with their posterior."""
+    """A fit: values of all unknowns, with their posterior."""
 
-    x: Array  # state before the record
+    x: Array  # state of G before the record
     p0: float  # p before the record
     theta: Array  # m, o, g, xi (3 + K,)
-    noise_std: float  # beside a step
-    knots: Array = field(default_factory=lambda: np.zeros(0))  # of the walk of u (W,)
-    walk_std: float = 0.0  # per square root of a sample, 0 for none
-    step: float = 0.0  # of the readings where they are taken for intervals, else 0
-    scale: float = 1.0  # s, the likeliest
-    cov: Array = field(default_factory=lambda: np.zeros((0, 0)))  # as if residuals were white
-    volume: float = 0.0  # log of that of the posterior
-    spread: Array = field(default_factory=lambda: np.zeros((3, 3)))  # of m, c_r, c_l, by other gaps
+    noise_std: float  # of y; without quantization if step > 0
+    knots: Array = field(default_factory=lambda: np.zeros(0))  # values of d (W,)
+    walk_std: float = 0.0  # of u per square root of a sample, 0: no walk
+    step: float = 0.0  # quantization step if readings are taken as intervals, else 0
+    scale: float = 1.0  # most probable s
+    cov: Array = field(default_factory=lambda: np.zeros((0, 0)))  # of theta, white residuals
+    volume: float = 0.0  # log volume of the posterior
+    spread: Array = field(default_factory=lambda: np.zeros((3, 3)))  # of m, c_r, c_l: other gaps
     left: Left = field(default_factory=Left)
 
     @property
@@ -144,12 +144,12 @@ class WindowFit:
 
     @property
     def evidence(self) -> float:
-        """Log-likelihood with unknowns integrated out."""
+        """Log-likelihood with all unknowns integrated out."""
         return self.left.likelihood + self.volume
 
     @property
     def inflation(self) -> float:
-        """Of the covariance: N correlated residuals are N / (1 - rho + N rho) independent ones."""
+        """Factor on cov: N correlated residuals count as N / (1 - rho + N rho) independent ones."""
         return self.left.dispersion + (self.left.readings - 1.0) * self.left.correlation
 
     @property
@@ -158,13 +158,13 @@ class WindowFit:
 
     @property
     def prior_of_xi(self) -> Prior:
-        """What it knows of xi alone."""
+        """Its posterior of xi alone, as the prior of another fit."""
         count = len(self.theta) - 3
         root = np.linalg.inv(np.linalg.cholesky(self.cov_xi + 1e-12 * np.eye(count)))
         return Prior(np.hstack([np.zeros((count, 3)), root]), root @ self.theta[3:])
 
     def behind(self, xi: Array) -> float:
-        """Log-likelihood by which another error of G, xi (K,), is the worse one."""
+        """Log-likelihood by which another xi (K,) is worse than that of this fit."""
         apart = self.theta[3:] - xi
         cov = self.cov_xi + 1e-16 * np.eye(len(apart))
         return 0.5 * float(apart @ np.linalg.solve(cov, apart))
@@ -183,7 +183,7 @@ class WindowFit:
         return np.asarray(by @ self.cov[:3, :3] @ by.T * self.inflation + self.spread)
 
     def alike(self, other: WindowFit) -> bool:
-        """Whether the backlashes of two fits differ by chance."""
+        """Whether the backlashes of two fits differ by no more than chance."""
         return agree(self.crossings, other.crossings, self.crossings_cov + other.crossings_cov)
 
     @property
@@ -197,34 +197,34 @@ class WindowFit:
 
     @property
     def noise(self) -> float:
-        """Standard deviation of a reading, rounding included."""
+        """Standard deviation of a reading, quantization included."""
         return sqrt(self.noise_std**2 + self.step**2 / 12.0)
 
     @property
     def unexplained(self) -> float:
-        """Correlated residual motion over m times the gap."""
+        """RMS of the correlated part of the residuals, over m times the gap."""
         moves = sqrt(self.left.correlation) * self.left.rms
         return moves / (abs(self.m) * max(self.gap, 1e-12))
 
     @property
     def systematic(self) -> bool:
-        """Whether residuals are correlated beyond chance, and larger than rounding alone is."""
+        """Whether residuals are correlated beyond chance and larger than quantization errors."""
         rounding = 1.1 * self.step / sqrt(12.0)
         return self.left.readings * self.left.correlation > 1.0 and self.left.rms > rounding
 
     @property
     def without_intervals(self) -> WindowFit:
-        """The same values with readings that are normal, rounding being part of the noise."""
+        """The same values for readings that are normal, with quantization as part of the noise."""
         return replace(self, step=0.0, noise_std=self.noise)
 
     @property
     def valid(self) -> bool:
-        """Whether it is a backlash with finite deviations."""
+        """Whether the slope is positive and the covariance finite."""
         return self.m > 0.0 and self.cov.size > 0 and bool(np.isfinite(self.cov).all())
 
 
 def agree(one: Array, other: Array, cov: Array) -> bool:
-    """Whether two vectors (n,) differ by chance; cov: of their difference (n, n)."""
+    """Whether vectors (n,) agree by a chi-square test; cov: of their difference (n, n)."""
     from scipy.special import chdtri  # where fits are made: 31 MB
 
     apart = one - other
@@ -235,8 +235,8 @@ def agree(one: Array, other: Array, cov: Array) -> bool:
 def error_of_plant(
     f: WindowFit, r: Array, squares: float, freedom: float, most_scale: float,
 ) -> tuple[Array, Array, float, float, float]:
-    """xi (K,), its covariance and scale, what it adds to the evidence, variance of the noise over
-    that of f; r: triangle of xi (K + 1, K + 1)."""
+    """Posterior of xi, over a grid of s: mean, covariance, most probable s, its share of `volume`,
+    and noise variance over that of f. r: triangle of xi, (K + 1, K + 1); squares: of residuals."""
     k, variance = len(r) - 1, 1.0 if f.step else squares / freedom
     if not k:
         return np.zeros(0), np.zeros((0, 0)), f.scale, 0.0, variance

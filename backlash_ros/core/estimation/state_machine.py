@@ -1,15 +1,15 @@
-"""From a record and what was believed before to what is believed now: a pure function.
+"""Updates what is believed of the backlash with a record of samples: a pure function.
 
 | state     | meaning                    | published            | left for, when                  |
 |-----------|----------------------------|----------------------|---------------------------------|
-| SEARCHING | no fit explains the record | first guess, or what | KNOWN: a fit is known well      |
-|           |                            | was known before     | enough, twice in a row          |
+| SEARCHING | no fit explains the record | first guess, or what | KNOWN: two fits in a row are    |
+|           |                            | was known before     | known well enough and agree     |
 | KNOWN     | the fit explains all       | the fit              | DOUBTED: newer samples          |
 |           | samples                    |                      | contradict it                   |
 | DOUBTED   | newer samples contradict   | the fit before them  | KNOWN: it predicts again, or    |
-|           | the fit                    |                      | another backlash does;          |
-|           |                            |                      | SEARCHING: nothing does for as  |
-|           |                            |                      | long as a search looks          |
+|           | the fit                    |                      | another backlash explains them; |
+|           |                            |                      | SEARCHING: neither happens for  |
+|           |                            |                      | as long as it is waited for     |
 """
 
 from math import isnan, sqrt
@@ -30,15 +30,15 @@ from backlash_ros.core.window import Window
 
 
 def learn(setup: Setup, record: Window, before: Belief) -> Belief:
-    """What is believed with the samples of this record, which begins at `before.kept.first`.
+    """Update the belief with a record that begins at sample `before.kept.first`.
 
-    Raises nothing: where the numbers get too large, it begins anew with the newest samples.
+    If the numerics fail, the search starts anew with the newest samples; nothing is raised.
     """
     look = {State.SEARCHING: _searching, State.KNOWN: _known, State.DOUBTED: _doubted}
     kept, record = before.kept, record.without(before.kept.rejected)
     try:
         with np.errstate(all='ignore'):
-            if before.fit is not None and record.is_open:  # late commands contradict nothing
+            if before.fit is not None and record.is_open:  # late commands are no contradiction
                 p, since = setup.problem(record, kept.older), before.end - setup.family.memory
                 record, swapped = likelier(p, before.fit, record, since, kept.swapped)
                 before = before._replace(kept=kept._replace(swapped=swapped))
@@ -49,7 +49,7 @@ def learn(setup: Setup, record: Window, before: Belief) -> Belief:
 
 
 def _begun_anew(before: Belief, first: int, end: int, next_at: int) -> Belief:
-    """Nothing is known of the samples; what was published stays."""
+    """Drop the fit and all samples before `first`; what was published stays."""
     return before._replace(
         reason=before.reason if before.fit is None else Status.INCONSISTENT, fit=None, found=None,
         doubt_from=None, end=end, next_at=next_at,
@@ -63,14 +63,14 @@ def _searching(setup: Setup, record: Window, before: Belief) -> Belief:
     if tried is not None and not known_once and record.end < before.thorough[0] \
             and not setup.is_known(tried, record.turns(max(tried.gap, 0.0), tried.p0)):
         return before._replace(end=record.end, next_at=soon)
-    # What many reversals do not tell, a few more will not.
+    # If many reversals did not suffice, a few more will not: wait longer for the next search.
     growth = 2.0 if tried and tried.left.turns >= settings.HELD_REVERSALS else settings.GROWTH
     search_at = record.end + max(int(count * (growth - 1.0)), FEWEST)
     fit, shorter = afresh(setup, record, also=tried, walks=True), record
     why = _why(setup, fit, record, before)
     part, found, swapped = _with_commands(setup, record, fit, before.kept.swapped)
     while why in (Status.INCONSISTENT, Status.NOT_EXCITED) and len(shorter.v) >= 150:
-        # What happened at its beginning may have spoilt a record; 50 samples are the shortest part.
+        # An early event may have spoilt the record: try its newest third, down to 50 samples.
         shorter = shorter.between(shorter.end - len(shorter.v) // 3)
         newest = _with_commands(setup, shorter, afresh(setup, shorter), before.kept.swapped)
         if newest[1] is not None and setup.is_known(newest[1]):
@@ -85,12 +85,12 @@ def _searching(setup: Setup, record: Window, before: Belief) -> Belief:
         after = after._replace(coasts=True, reason=Status.INCONSISTENT)
     after = after._replace(kept=before.kept._replace(swapped=swapped), found=found)
     if not setup.is_known(found):
-        # But for a reversal, which may come soon?
+        # Look again soon if nothing but another reversal is missing.
         return after._replace(next_at=soon) if setup.is_known(found, settings.REVERSALS) else after
     if tried is None or not known_once or not tried.alike(found):
-        # A first estimate has to be found twice: some samples alone may mislead.
+        # A first estimate must be found twice in a row: a few samples alone may mislead.
         return after._replace(next_at=soon)
-    # What leaves more than noise must predict a quarter as many samples before it is believed.
+    # A fit that leaves more than noise must first predict a quarter as many new samples.
     more = len(part.v) // 4 if found.systematic or setup.noisier(found) else 0
     trial = before.trial._replace(must=max(before.trial.must, more))
     return _adopted(setup, part, found, None, after._replace(trial=trial))
@@ -99,7 +99,7 @@ def _searching(setup: Setup, record: Window, before: Belief) -> Belief:
 def _with_commands(
     setup: Setup, record: Window, found: WindowFit | None, swapped: frozenset[int],
 ) -> tuple[Window, WindowFit | None, frozenset[int]]:
-    """The record, the fit and the commands that go with each other, found in turn."""
+    """Alternate between late commands and the fit until both are consistent."""
     if found is None or not record.is_open:
         return record, found, swapped
     sent = record, found, swapped
@@ -108,7 +108,7 @@ def _with_commands(
         if now == swapped:
             break
         swapped, found = now, afresh(setup, record, also=found) or found
-    # Commands that leave more than noise explain nothing: those that were sent stay.
+    # If more than noise remains, late commands explain nothing: keep the record as it was sent.
     noisier = found.systematic and setup.noisier(found)
     return sent if noisier else weighed(setup, record, found, swapped, None)
 
@@ -120,7 +120,7 @@ def _why(setup: Setup, found: WindowFit | None, record: Window, before: Belief) 
     if found is None:
         crosses = known and np.ptp(record.v) > known.crossings[1] - known.crossings[2]
         return Status.INCONSISTENT if crosses else Status.NOT_EXCITED
-    # Until v has swung past the gap a fit may have none: the gap of the first guess counts then.
+    # Until v has crossed the gap, a fit may find next to none: then use that of the first guess.
     gap = max(found.gap, setup.guess)
     large = found.unexplained * found.gap > settings.NEGLIGIBLE * gap \
         or record.turns(gap, float(record.v[0])) >= settings.HELD_REVERSALS
@@ -134,7 +134,7 @@ def _adopted(
     count, must = len(record.v), before.trial.must
     another_noise = before.published is None or fit.walk_std > 0.0
     if before.fit is not None and another_noise and fit.alike(before.fit):
-        must = min(must, PREDICTED)  # another noise, or a walk, but not another backlash
+        must = min(must, PREDICTED)  # another noise, or a walk, but the same backlash
     return _published(setup, before._replace(
         found=None, doubt_from=None, coasts=coasts(setup.problem(record, older), fit),
         kept=before.kept._replace(first=record.first, older=older),
@@ -157,16 +157,16 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
         numbers = frozenset((record.first + new + np.flatnonzero(wild)).tolist())
         cleaned = before._replace(kept=kept._replace(rejected=kept.rejected | numbers))
         return _known(setup, record.without(numbers), cleaned)
-    # What was known before the run is not to be moved by samples that the fit does not explain.
+    # Samples that the fit does not explain must not move an estimate from before the run.
     rho = held.left.correlation if before.inherited is None else 0.0
     if _contradicts(problem, held, fit, new, rho):
-        fit = problem.fitted(held)  # before anything is blamed
-    lately = trial.predicted < settings.LASTING * trial.must  # it replaced one that did not last
+        fit = problem.fitted(held)  # converge before blaming the samples
+    lately = trial.predicted < settings.LASTING * trial.must  # still on trial, after another
     grown = lately and fit.noise > settings.AS_GOOD * trial.noise
     if grown or _contradicts(problem, held, fit, new, rho):
         beyond = np.nan_to_num((problem.residual(held)[new:] / held.noise) ** 2 - MISFIT)
         change = int(np.argmax(np.cumsum(beyond[::-1])[::-1]))
-        # What contradicts one explanation after the other is no backlash.
+        # Samples that contradict one explanation after another come from no backlash.
         must = min(2 * trial.must, settings.MOST_PREDICTED) if lately else PREDICTED
         return before._replace(
             end=record.end, found=None, trial=trial._replace(must=must),
@@ -186,13 +186,13 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
             if swapped != kept.swapped:
                 problem = setup.problem(record, kept.older)
                 after = after._replace(kept=kept._replace(swapped=swapped))
-        elif fit.step or fit.spread.any():  # else it has been normal for long
+        elif fit.step or fit.spread.any():  # else the posterior is normal
             fit = mixed(problem, fit)
         fit = with_walk(problem, fit, setup.walk_std)
         after = after._replace(thorough=(record.end + 2 * count // 5, 0.5 * fit.gap_std))
     else:
         fit = problem.finished(fit)
-    if not fit.alike(held):  # nothing contradicted what was held: let the next samples decide
+    if not fit.alike(held):  # no contradiction, yet another backlash: let the next samples decide
         after = after._replace(trial=Trial(PREDICTED, 0, fit.noise), reason=Status.ACQUIRING)
     after = after._replace(coasts=coasts(problem, fit))
     return _published(setup, *shortened(setup, record, problem, after, fit))
@@ -201,8 +201,8 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
 def _contradicts(
     problem: Problem, held: WindowFit, fit: WindowFit, new: int, rho: float,
 ) -> bool:
-    """Whether samples from `new` on contradict what was held, or `fit` takes them in at the cost of
-    all others; rho: correlation of residuals."""
+    """Whether the refit `fit` leaves more than the noise of the held fit: in samples from index
+    `new` on, or in all, if it gained those at the cost of the others. rho: their correlation."""
     weights = problem.at(fit).weights
     z = problem.residual(fit) / held.noise
     total = float(weights.sum())
@@ -216,7 +216,7 @@ def _contradicts(
 
 
 def _most(least: float, count: float, rho: float) -> float:
-    """Mean square of so many normalized residuals of correlation rho that is no chance."""
+    """Largest mean square by chance of so many normalized residuals of this correlation, >= least."""
     from scipy.special import chdtri  # where fits are made: 31 MB
 
     free = max(count / (1.0 + (count - 1.0) * rho), 1.0)
@@ -224,7 +224,7 @@ def _most(least: float, count: float, rho: float) -> float:
 
 
 def _doubted(setup: Setup, record: Window, before: Belief) -> Belief:
-    """The samples since the doubt: over, another backlash, or nothing that explains them."""
+    """Judge the samples since the doubt: it is over, another backlash acts, or neither is clear."""
     held, since, kept = before.fit, before.doubt_from, before.kept
     assert held is not None
     assert since is not None
@@ -233,7 +233,7 @@ def _doubted(setup: Setup, record: Window, before: Belief) -> Belief:
         end=record.end, found=None, next_at=record.end + max(newer // 4, FEWEST))
     z = setup.problem(record, kept.older).residual(held) / held.noise
     if newer >= 2 * PREDICTED and np.nanmean(z[-PREDICTED:] ** 2) < MISFIT:
-        # Whatever it was, it is over: what was measured meanwhile says nothing.
+        # Whatever it was, it is over: the readings taken meanwhile are discarded.
         lost = frozenset(range(since, record.end - PREDICTED))
         return after._replace(
             doubt_from=None, kept=kept._replace(rejected=kept.rejected | lost),
@@ -260,19 +260,19 @@ def _doubted(setup: Setup, record: Window, before: Belief) -> Belief:
         return _adopted(setup, part, found, held.prior_of_xi, after)
     if whole is not None and setup.is_known(whole):
         return _adopted(setup, record, whole, None, after)
-    # Two reversals of the record take so long, on average.
+    # Give up after the time that two reversals of the record take on average.
     if newer > max(short, 2 * count // max(held.left.turns, 1)):
         return _begun_anew(after, since, record.end, record.end + 1)
     return after
 
 
 def _published(setup: Setup, belief: Belief, fit: WindowFit) -> Belief:
-    """This belief with that fit, and what is published of it."""
+    """The belief with a new fit, published if it is known well enough."""
     belief, known = belief._replace(fit=fit), belief.inherited
     if known is not None:
         return _beside_inherited(setup, belief, fit, known)
     if not setup.is_known(fit, settings.REVERSALS if belief.kept.older is not None else None):
-        # Newer samples may tell that less is known than it seemed: that is no contradiction.
+        # Newer samples may show that less is known than it seemed: that is no contradiction.
         wrong = not fit.valid or setup.moves_unexplained(fit) or setup.outside_bounds(fit)
         return belief._replace(reason=Status.INCONSISTENT if wrong else Status.ACQUIRING)
     if belief.trial.predicted < belief.trial.must:
@@ -284,28 +284,28 @@ def _published(setup: Setup, belief: Belief, fit: WindowFit) -> Belief:
 
 
 def _beside_inherited(setup: Setup, belief: Belief, fit: WindowFit, known: Known) -> Belief:
-    # What samples leave unexplained may be gap too, and a gear's lost motion differs by motion.
-    replacing = 0.05  # std of the gap over the gap, from which samples alone replace what was known
+    # Unexplained motion may be gap as well, and the lost motion of a gear varies with its motion.
+    replacing = 0.05  # std of the gap over the gap below which samples replace what was known
     doubt = (fit.unexplained * fit.gap) ** 2 / 2.0
     cov = fit.crossings_cov + doubt * np.diag([0.0, 1.0, 1.0])
     gap = known.crossings[1] - known.crossings[2]
     of_motion = (settings.LOST_MOTION * gap) ** 2 / 2.0
     prior = known.cov + 1e-18 * np.diag(known.crossings**2 + gap**2)
-    as_told = agree(fit.crossings, known.crossings, cov + prior)
-    if not as_told:
+    compatible = agree(fit.crossings, known.crossings, cov + prior)
+    if not compatible:
         prior = prior + np.diag([(0.01 * known.crossings[0]) ** 2, of_motion, of_motion])
     if not agree(fit.crossings, known.crossings, cov + prior):
         std = sqrt(fit.gap_std**2 + 2.0 * doubt)
-        # A gear that is no play leaves systematic residuals, and denies nothing.
+        # A gear that is not pure play leaves systematic residuals, which refute nothing.
         white = not fit.systematic and not setup.noisier(fit)
         sure = std < replacing * fit.gap and white and fit.left.turns >= settings.HELD_REVERSALS
         if sure and belief.trial.predicted >= belief.trial.must:
-            belief = belief._replace(inherited=None)  # it was that of another plant
+            belief = belief._replace(inherited=None)  # it belonged to another plant
         return belief._replace(reason=Status.INCONSISTENT)
     gain = prior @ np.linalg.pinv(cov + prior)
     joined = Known(known.crossings + gain @ (fit.crossings - known.crossings), prior - gain @ prior)
-    if belief.coasts or (not as_told and fit.systematic):
-        joined = known  # what explains y no better is no reason to move
+    if belief.coasts or (not compatible and fit.systematic):
+        joined = known  # a fit that leaves motion unexplained must not move it
     if not setup.are_precise(*joined, fit.systematic):
         return belief._replace(reason=Status.ACQUIRING)
     reason = Status.INCONSISTENT if setup.moves_unexplained(fit) else Status.TRACKING
