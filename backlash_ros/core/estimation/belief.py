@@ -1,4 +1,4 @@
-"""What is believed of the backlash, and what older samples leave of it."""
+"""The state of the estimator, and how old samples are dropped but not forgotten."""
 
 from dataclasses import replace
 from enum import Enum, auto
@@ -18,7 +18,7 @@ from backlash_ros.core.window import Window
 
 
 class State(Enum):
-    """How the fit stands to the newest samples; state_machine.py has the table of transitions."""
+    """How the fit relates to the newest samples; state_machine.py has the table of transitions."""
 
     SEARCHING = auto()
     KNOWN = auto()
@@ -33,16 +33,16 @@ class Known(NamedTuple):
 
 
 class Kept(NamedTuple):
-    """What is kept of the samples: those from number `first` on, and what the older ones say."""
+    """What is kept of the samples: those from `first` on, and the information in older ones."""
 
     first: int = 0
     older: Prior | None = None
-    rejected: frozenset[int] = frozenset()  # numbers of readings that are outliers
-    swapped: frozenset[int] = frozenset()  # of samples over which the other command acted
+    rejected: frozenset[int] = frozenset()  # samples whose reading is an outlier
+    swapped: frozenset[int] = frozenset()  # samples in whose interval the other v acted
 
 
 class Trial(NamedTuple):
-    """Samples that a fit must predict before it is published, and has; its noise when adopted."""
+    """Samples that a fit must predict to be published, samples it has predicted, initial noise."""
 
     must: int = 0
     predicted: int = 0
@@ -53,17 +53,17 @@ class Belief(NamedTuple):
     """What is believed after the samples before `end`."""
 
     fit: WindowFit | None = None
-    found: WindowFit | None = None  # the newest that is not adopted
-    doubt_from: int | None = None  # sample from which on the fit is contradicted
+    found: WindowFit | None = None  # newest candidate, not adopted so far
+    doubt_from: int | None = None  # first sample that contradicts the fit
     end: int = 0
-    next_at: int = settings.FIRST_FIT  # number of samples at which to look again
-    thorough: tuple[int, float] = 0, 0.0  # the same for other gaps, or deviation of this one
+    next_at: int = settings.FIRST_FIT  # sample at which the next fit is due
+    thorough: tuple[int, float] = 0, 0.0  # the same for other gaps, or std of the gap to fall below
     kept: Kept = Kept()
     trial: Trial = Trial()
     published: Known | None = None
-    inherited: Known | None = None  # before the run
-    reason: Status = Status.ACQUIRING  # of what is published
-    coasts: bool = False  # whether the load runs on within the gap
+    inherited: Known | None = None  # estimate from before the run
+    reason: Status = Status.ACQUIRING  # status of what is published
+    coasts: bool = False  # whether the load coasts in the gap
 
     @property
     def state(self) -> State:
@@ -80,7 +80,7 @@ class Belief(NamedTuple):
 def shortened(
     setup: Setup, record: Window, problem: Problem, belief: Belief, fit: WindowFit,
 ) -> tuple[Belief, WindowFit]:
-    """Let the oldest samples go, but for what they say of theta, once the others hold enough."""
+    """Drop the oldest samples once the others suffice; what they say of theta stays as a prior."""
     count, kept, cut = len(record.v), belief.kept, 0
     drift = setup.drift**2 * count / 3.0
     if count >= settings.LONGEST or (
@@ -111,8 +111,8 @@ def shortened(
 
 
 def _aged(setup: Setup, fit: WindowFit, prior: Prior, samples: int) -> Prior:
-    """What is left of a prior after so many samples of drift and walk."""
-    discount = sqrt(fit.left.dispersion / fit.inflation)  # a dispersion counts once, in the end
+    """The prior, discounted for correlated residuals and widened by drift and walk since then."""
+    discount = sqrt(fit.left.dispersion / fit.inflation)  # cov is inflated by dispersion later on
     rows, values = discount * prior.rows, discount * prior.values
     if setup.drift.any():
         try:
@@ -120,12 +120,12 @@ def _aged(setup: Setup, fit: WindowFit, prior: Prior, samples: int) -> Prior:
         except np.linalg.LinAlgError:
             return Prior(rows[:0], values[:0])
         m, c_r, _ = fit.crossings
-        by = np.array([[1.0, 0.0, 0.0], [c_r, m, 0.0], [0.0, 1.0, -1.0]])  # of m, o, g
+        by = np.array([[1.0, 0.0, 0.0], [c_r, m, 0.0], [0.0, 1.0, -1.0]])  # Jacobian of m, o, g
         theta = np.linalg.lstsq(rows, values, rcond=None)[0]
         cov[:3, :3] += by @ np.diag(setup.drift**2 * samples) @ by.T
         rows = np.linalg.inv(np.linalg.cholesky(cov))
         values = rows @ theta
-    if fit.walk_std:  # o has walked on since
+    if fit.walk_std:  # o has walked since: marginalize it
         both = np.column_stack([rows[:, 1], np.delete(rows, 1, axis=1), values])
         r = np.asarray(np.linalg.qr(both, mode='r'))[1:]
         rows, values = np.insert(r[:, 1:-1], 1, 0.0, axis=1), r[:, -1]

@@ -1,4 +1,4 @@
-"""The default law: it records samples, lets fits be made elsewhere, and publishes what they say.
+"""The default law: records samples, has them fitted outside the loop, publishes the results.
 
 Moving-horizon estimation of backlash, G, its state and the noise at once (C. V. Rao, J. B.
 Rawlings, D. Q. Mayne, IEEE Trans. Automatic Control 48 (2003) 246-258).
@@ -28,7 +28,7 @@ from backlash_ros.core.window import Recorder, Window
 
 
 class Proposal(NamedTuple):
-    """A G that was learned, its xi (K,), () if it is to be left, and the gains of its observer."""
+    """A G that was learned, its xi (K,) (empty: G is not to be learned), gains of its observer."""
 
     model: StateModel
     xi: Array
@@ -36,7 +36,7 @@ class Proposal(NamedTuple):
 
 
 class Fitted(NamedTuple):
-    """What comes of a fit: what is believed, where play and G stand, a better G if there is one."""
+    """Result of a fitting job: belief, where play and G stand, and a better G if there is one."""
 
     belief: Belief
     place: Place | None = None
@@ -46,9 +46,9 @@ class Fitted(NamedTuple):
 def fitted(
     samples: Window, setup: Setup, before: Belief, model: TransferFunction, proposed: Array,
 ) -> Fitted:
-    """What is believed with these samples: the job that is done beside the loop.
+    """Update the belief with these samples: the job that is done outside the loop.
 
-    model: whose state the structure wants. proposed: xi of the newest G (K,), () if to be left.
+    model: G in use, whose state is wanted. proposed: xi of the newest proposal (K,), empty: none.
     """
     record = samples.swapped(before.kept.swapped)
     belief = learn(setup, record.between(record.end - settings.LONGEST), before)
@@ -67,10 +67,10 @@ def fitted(
 
 
 class MovingHorizon(Law):
-    """Learns (m, c_r, c_l) and the error of G from y alone.
+    """Learns (m, c_r, c_l) and the error of G from v and y alone.
 
-    initial: a first guess, or with its deviations what was learned before. observer: gives the
-    state of G until the backlash is known, for structures that want it.
+    initial: a first guess or, if it has standard deviations, an earlier result. observer: provides
+    the state of G until the backlash is known, for structures that need it.
     """
 
     RETUNED = 'estimator.output_noise_std', 'estimator.input_noise_std', 'estimator.drift_std'
@@ -93,9 +93,9 @@ class MovingHorizon(Law):
             self._belief = Belief(inherited=known, published=known)
         self._following = Following(model, observer)
         self._proposed = Proposal(model, np.zeros(0 if initial.learned else family.count))
-        self._recording = True  # whether the newest sample was one to learn from
+        self._recording = True  # whether the newest sample was to be learned from
         self._lost_in_a_row = self._failed_fits = self._reattributed = 0
-        self._skipping_fit = False  # whether the fit under way is of a record that was given up
+        self._skipping_fit = False  # whether to ignore the fit under way
 
     @property
     def u_hat(self) -> float:
@@ -164,7 +164,7 @@ class MovingHorizon(Law):
 
     def update(self, y: float | None, interval: Interval) -> None:
         if self.adapting and not self._recording:
-            # Another record: the samples before it are not those before the next one.
+            # Start a new record: samples before the pause do not join those after it.
             before, end = self._belief, self._record.end
             self._belief = Belief(
                 kept=Kept(first=end), end=end, next_at=end + settings.FIRST_FIT,
@@ -174,7 +174,7 @@ class MovingHorizon(Law):
         self._lost_in_a_row = self._lost_in_a_row + 1 if y is None else 0
         following, family = self._following, self._setup.family
         following.step(y, interval, self.estimate)
-        resting = following.since_motion > family.memory  # longer than G remembers
+        resting = following.since_motion > family.memory  # transients of G have died out
         if self.adapting and not (resting and not family.integrates):
             self._record.append(interval.v, nan if y is None else y, interval.other)
         status = self._belief.reason
@@ -193,7 +193,7 @@ class MovingHorizon(Law):
         resting = following.observer and following.since_motion > setup.family.memory
         if channel.busy or not due or not self.adapting or resting:
             return
-        following.beyond += following.surprised  # once
+        following.beyond += following.surprised  # only once per surprise
         channel.submit(fitted, self._record.since(self._belief.kept.first), setup, self._belief,
                        following.model.transfer_function, self._proposed.xi)
         self._take(channel.poll())
@@ -216,7 +216,7 @@ class MovingHorizon(Law):
             return
         self._proposed = result.better or self._proposed
         if not belief.trusted and following.observer is not None:
-            following.observer.settle(fit.noise)  # no fit says where the state is
+            following.observer.settle(fit.noise)  # no fit gives the state
             return
         newer = self._record.since(belief.end)
         following.go_on_from(place, np.array([newer.v, newer.y]), self.estimate, fit.noise,
@@ -227,8 +227,8 @@ class MovingHorizon(Law):
         std_m, std_c_r, std_c_l = np.sqrt(np.maximum(np.diag(known.cov), 0.0)).tolist()
         fit = belief.fit or belief.found
         if belief.coasts and fit is not None:
-            # Motion of the load within the gap makes the gap doubtful: a structure that shrinks it
-            # by its deviations pushes the load less. A fit of its own may have next to no gap.
+            # A load that moves within the gap makes the gap doubtful: with larger deviations, a
+            # structure that shrinks the gap by them pushes the load less.
             doubt = 0.5 * fit.unexplained * fit.gap
             std_c_r, std_c_l = hypot(std_c_r, doubt), hypot(std_c_l, doubt)
         return Estimate(*values, e.f, std_m, std_c_r, std_c_l, e.status)

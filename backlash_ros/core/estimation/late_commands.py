@@ -1,9 +1,9 @@
-"""Which of two commands acted over an interval where one may have come too late.
+"""Decides which of two commands acted in an interval, where the newer one may have come too late.
 
-The one that is not in the record would add s to y. With s in the residuals r, it is
-(s.r - s.s / 2) / sigma^2 more likely, less the log-odds against it, by Jeffreys' prior (k + 1/2) to
-(n - k - 1/2) after k of n were late (A. S. Willsky, H. L. Jones, IEEE Trans. Automatic Control 21
-(1976)). The likeliest is believed first, until none is likely.
+If the command that is not in the record acted, it would add s to y. With residuals r, this raises
+the log-likelihood by (s.r - s.s / 2) / sigma^2 (A. S. Willsky, H. L. Jones, IEEE Trans. Automatic
+Control 21 (1976)). Prior odds, after k of n commands were late: k + 1/2 to n - k - 1/2 (Jeffreys).
+The likeliest swap is made first, and the rest compared again, until none is likely.
 """
 
 from dataclasses import replace
@@ -23,9 +23,9 @@ from backlash_ros.core.window import Window
 def likelier(
     problem: Problem, fit: WindowFit, record: Window, since: int, back: frozenset[int],
 ) -> tuple[Window, frozenset[int]]:
-    """The record as it is likelier from `since` on, and where in it the other command acted.
+    """Swap commands from sample `since` on where the other one is likelier to have acted.
 
-    back: numbers of the samples over which it acts already.
+    back: samples swapped so far. Returns the record and all samples that are swapped in it.
     """
     open_ = np.flatnonzero(np.isfinite(record.other))
     count, late = len(open_), len(record.places(back))
@@ -38,14 +38,14 @@ def likelier(
     known = problem.known.astype(np.float64)
     q = basis(problem.jacobian(fit) * known[:, None])
     residual = problem.at(fit).error.copy()
-    # Correlated residuals are for the most part made by the commands that are looked for.
+    # Correlated residuals are mostly due to the very commands that are looked for.
     noise = max(fit.noise * (0.25 if fit.systematic else 1.0), problem.nominal,
                 problem.step_of_readings / sqrt(12.0))
     v, other = record.v.copy(), record.other.copy()
     swapped = before = np.isin(record.first + open_, list(back))
 
     def added(k: int) -> Array:
-        """What y has more, where the other command acts over interval k."""
+        """Change of y if the other command acts in interval k."""
         acting = np.append(other[k], v[k + 1:k + reach])
         moved = play(acting, fit.gap, float(p[k - 1]) if k else fit.p0) - p[k:k + reach]
         return lfilter(b, a, fit.m * moved) * known[k:k + reach]
@@ -54,17 +54,17 @@ def likelier(
         padded = np.pad(values[open_[0]:], (0, reach - 1))
         return np.asarray(np.correlate(padded, weights)[open_ - open_[0]])
 
-    # Most move p for one interval alone: for these all is known from what a move by 1 adds.
+    # Most swaps move p in one interval only: their effect is that of a unit pulse, scaled.
     pulse = lfilter(b, a, fit.m * (np.arange(reach) == 0.0))
     squares = sums(known, pulse**2) - sum(sums(column, pulse)**2 for column in q.T)
-    for _ in range(200):  # swaps of one look
+    for _ in range(200):  # at most this many swaps at once
         p = play(v, fit.gap, fit.p0)
         more, less = (log(max(count - k, 1) - 0.5) - log(k + 0.5) for k in (late, max(late - 1, 0)))
         rest = residual - q @ (q.T @ residual)
         at = np.clip(np.append(fit.p0, p[:-1])[open_], other[open_], other[open_] + fit.gap)
         moved, after = at - p[open_], np.minimum(open_ + 1, len(v) - 1)
         gains = moved * sums(rest, pulse) - 0.5 * moved**2 * squares
-        on = np.clip(at, v[after], v[after] + fit.gap) != p[after]  # whether later p move as well
+        on = np.clip(at, v[after], v[after] + fit.gap) != p[after]  # whether later p change, too
         for i in np.flatnonzero((moved != 0.0) & on):
             k = int(open_[i])
             seen = added(k)
@@ -85,8 +85,8 @@ def likelier(
 def weighed(
     setup: Setup, record: Window, fit: WindowFit, swapped: frozenset[int], older: Prior | None,
 ) -> tuple[Window, WindowFit, frozenset[int]]:
-    """These, or the record as it was sent where that is likelier, with the spread that the other
-    leaves: around a wrong fit a command may look late that was not."""
+    """Choose between the swapped record and the one that was sent, as a wrong fit makes commands
+    look late. Returns record, fit and swapped samples; the other fit adds to the spread."""
     from scipy.special import betaln  # where fits are made: 31 MB
 
     late, open_ = len(record.places(swapped)), np.isfinite(record.other).sum()

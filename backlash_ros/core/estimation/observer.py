@@ -1,10 +1,10 @@
-"""Between two fits: u from the play operator, the state of G from an observer with a constant gain.
+"""Between fits: u from the play operator, the state of G from an observer with constant gain.
 
     x_i(k+1) = x_{i+1}(k) - a_i x_1(k) + b_i u(k) + k_i (y(k) - x_1(k))
 
-In this observer form, whose first state is y, a step costs a few products. The gain is that of the
-stationary Kalman filter for white noise on u of the size at which the innovations are as large as
-they are (R. K. Mehra, IEEE Trans. Automatic Control 15 (1970) 175-184).
+In this observer form, whose first state is y, a step costs a few products. The gain is that of a
+stationary Kalman filter; the white noise on u is assumed to be just large enough to explain the
+size of the innovations (R. K. Mehra, IEEE Trans. Automatic Control 15 (1970) 175-184).
 """
 
 from __future__ import annotations
@@ -26,32 +26,32 @@ from backlash_ros.core.plant.backlash import clamp
 from backlash_ros.core.plant.numerics import Gain, gain_of
 from backlash_ros.core.plant.transfer_function import Array, StateModel, TransferFunction, powers
 
-# Stationary share of y of the noise on u, in units of the noise of y, that gains are made for.
+# Effects of the noise on u that gains are designed for, relative to the noise on y (`gain_of`).
 RATIOS = tuple(10.0**exponent for exponent in range(-4, 5))
 
 
 def gains_of(model: StateModel) -> tuple[Gain, ...]:
-    return tuple(gain_of(model, ratio) for ratio in RATIOS)  # milliseconds, too many for the loop
+    return tuple(gain_of(model, ratio) for ratio in RATIOS)  # takes too long for the loop
 
 
 class Observer:
-    """Follows the state of G, kept in the observer form; before: that of another G for this plant.
+    """Kalman observer of the state of G. before: the observer it replaces, of another G.
 
-    gains: of this G, if known. variance: of the innovation. cov: of StateModel's state (n, n).
+    gains: `gains_of` this G, or (). variance: of the innovation. cov: of StateModel's state (n, n).
     """
 
     def __init__(
         self, model: StateModel, noise_std: float, gains: Sequence[Gain],
         before: Observer | None = None,
     ) -> None:
-        # Innovations are no larger than with a G from before.
+        # A new G should not leave larger innovations than the one before.
         highest = len(RATIOS) if before is None else before.level
         self._model, self._gains = model, gains
         self._use(min(len(RATIOS) // 2, highest), noise_std)
         self.variance = (self._gain.innovation * noise_std) ** 2
         self._x = [0.0] * model.order
         self._to_state = tuple(map(tuple, model.to_state.tolist()))
-        # Take u over one period and return the y that is expected after it.
+        # Advances the state by one period with this u; returns the predicted y.
         self.predict = partial(model.transfer_function.advance, self._x)
 
     def _use(self, level: int, noise_std: float) -> None:
@@ -61,26 +61,26 @@ class Observer:
 
     @property
     def state(self) -> list[float]:
-        """x in the coordinates of StateModel."""
+        """x in the coordinates of StateModel, (n,)."""
         return [sum(map(mul, row, self._x)) for row in self._to_state]
 
     def place(self, x: Array, known: bool) -> None:
-        """Go on from this x in the observer form, which newer samples move little if `known`."""
+        """Set the state (in observer form); if it is `known`, continue with the smallest gain."""
         self._x[:] = x.tolist()
         if known:
             self._use(0, self.noise_std)
 
     def correct(self, innovation: float) -> None:
-        """Take in y minus what was expected."""
+        """Correct the state by an innovation, y minus its prediction."""
         x = self._x
         for i, k in enumerate(self._gain.gain):
             x[i] += k * innovation
         self.variance += (innovation * innovation - self.variance) / 100.0
 
     def settle(self, noise_std: float) -> None:
-        """Go a step towards the smallest gain that explains the innovations, with this noise."""
+        """Move one level towards the smallest gain that explains the innovations; set the noise."""
         gain, level = self._gain, self.level
-        # What chance explains: 15 % of the deviation.
+        # Chance explains 15 % of the standard deviation.
         if self.variance > (1.15 * gain.innovation * noise_std) ** 2:
             level = min(level + 1, len(RATIOS) - 1)
         elif self.variance < gain.innovation * gain.quiet * noise_std**2:
@@ -89,7 +89,7 @@ class Observer:
 
 
 class Place(NamedTuple):
-    """Where samples leave p and x of `model` (observer form); u, y: over the newest ones (M,)."""
+    """Where a fit ends: p, and x of `model` in observer form; u, y of its newest samples (M,)."""
 
     p: float
     u: Array
@@ -99,23 +99,23 @@ class Place(NamedTuple):
 
 
 def state_after(model: TransferFunction, u: Array, y: Array) -> Array:
-    """The state of this G (observer form) that explains y (M,), nan where lost, after u (M,)."""
+    """State of G (observer form) after u (M,), by least squares from y (M,), nan where lost."""
     a, b, c = model.state_space()
     responses = powers(a, b, len(u))
-    # The loop computes this as well, where a first import of SciPy would make commands late.
+    # Not by lfilter: the loop runs this too, and importing SciPy would make a command late.
     forced = np.convolve(responses @ c, u)[:len(u)]
-    columns = powers(a.T, a.T @ c, len(u))  # of the state before them
+    columns = powers(a.T, a.T @ c, len(u))  # response to the initial state
     known = np.isfinite(y)
     before = np.linalg.lstsq(columns[known], (y - forced)[known], rcond=1e-12)[0]
     return np.asarray(np.linalg.matrix_power(a, len(u)) @ before + u[::-1] @ responses)
 
 
 class Following:
-    """Follows play operator and state of G from sample to sample.
+    """Advances the play operator and the state of G from sample to sample.
 
-    before: gives the state until a backlash is known, observer: from then on. since_motion: samples
-    since p moved, v until then. outliers: readings that did not move the state. beyond: as many in
-    a row, and those after them.
+    The state comes from `before` until a backlash is known, then from `observer`. since_motion:
+    samples since p (before a backlash is known: v) last moved. outliers: readings rejected so far.
+    beyond: readings beyond the gate in a row.
     """
 
     def __init__(self, model: StateModel, before: FixedBacklash | None) -> None:
@@ -124,13 +124,13 @@ class Following:
         self.observer: Observer | None = None
         self.u = self.innovation = nan
         self.since_motion = self.outliers = self.beyond = 0
-        self._p = nan  # v until a backlash is known
-        # Over the newest samples. Numbers: the collector would have to visit so many pairs.
+        self._p = nan  # v, until a backlash is known
+        # Newest samples, as two queues of floats: pairs would burden the garbage collector.
         self._u, self._y = deque[float](maxlen=ROWS), deque[float](maxlen=ROWS)
 
     @property
     def surprised(self) -> bool:
-        """Whether the newest reading made so many beyond the gate in a row that they are none."""
+        """Whether the newest reading makes too many in a row beyond the gate to be outliers."""
         return self.beyond == OUTLIERS and not isnan(self.innovation)
 
     @property
@@ -151,7 +151,7 @@ class Following:
                 self.observer.place(x, True)
 
     def step(self, y: float | None, interval: Interval, estimate: Estimate) -> None:
-        """Take in y(k), None if it was lost, and v of the interval before it."""
+        """Process y(k), None if it was lost, and v of the interval before it."""
         observer, v, p = self.observer, interval.v, self._p
         if observer is None:
             self._p = v
@@ -164,7 +164,7 @@ class Following:
                 self.innovation = innovation = y - expected
                 inside = innovation * innovation <= GATE**2 * observer.variance
                 self.beyond = 0 if inside else self.beyond + 1
-                if inside or self.beyond >= OUTLIERS:  # so many in a row are none
+                if inside or self.beyond >= OUTLIERS:  # too many for outliers
                     observer.correct(innovation)
                 else:
                     self.outliers += 1
@@ -179,9 +179,9 @@ class Following:
     def go_on_from(
         self, place: Place, newer: Array, estimate: Estimate, noise_std: float, known: bool,
     ) -> None:
-        """Let play and observer stand where a fit says that they stood; take in newer v, y (2, M).
+        """Set play and observer to where a fit ended, then advance them by newer v, y (2, M).
 
-        known: whether the fit knows the state better than the newest samples do.
+        known: whether to trust the state of the fit more than newer samples.
         """
         own, other = self.model.transfer_function, place.model
         if not (np.array_equal(other.denominator, own.denominator)
@@ -195,5 +195,5 @@ class Following:
         for v, y in newer.T.tolist():
             self._advance(v, y, estimate)
             innovation = y - observer.predict(self.u)
-            if innovation * innovation <= GATE**2 * observer.variance:  # not where y was lost
+            if innovation * innovation <= GATE**2 * observer.variance:  # false if y was lost (nan)
                 observer.correct(innovation)

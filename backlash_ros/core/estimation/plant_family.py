@@ -1,11 +1,11 @@
-"""The linear plants that G(z) may be, with exact gain at rest.
+"""The family of linear plants that G(z) may be; all have the nominal gain at rest.
 
     G(z; xi) = z^-d [B (1 - f + f z^-1) + xi_w w (1 - z^-1)^2 B'] A(1)/A_nominal(1) / (A I)
 
-xi (K,), in units of prior deviations: where G integrates, the leak of an integrator; the lag (d + f
-samples beside the nominal delay, d whole); the width of the response, w = 1/8, B' = B one sample
-shorter; ln Omega, ln D of every section s^2 + 2 D Omega s + Omega^2 of two poles; ln of a single
-real pole. Poles at 0, on the negative axis or outside of the unit circle stay.
+xi (K,), in units of prior standard deviations: the leak of an integrator, if G integrates; a lag of
+d + f samples beside the nominal delay, d whole; the width of the response, with w = 1/8 and B' = B
+one sample shorter; ln Omega, ln D of each pair of poles, s^2 + 2 D Omega s + Omega^2; ln of a real
+pole left over. Poles at 0, on the negative axis or outside the unit circle are kept.
 """
 
 from cmath import cos, exp, sqrt
@@ -21,27 +21,27 @@ from backlash_ros.core.plant.transfer_function import ON_CIRCLE, Array, Transfer
 
 
 class Family(Protocol):
-    """Plants b / a that a fit chooses from, by K = count unknowns xi."""
+    """Plants b / a to be fitted, with K = count unknown parameters xi."""
 
     @property
     def count(self) -> int: ...
 
     @property
     def leaks(self) -> int:
-        """How many of the first xi have a prior of deviation 1 each; the others share a scale."""
+        """Number of first xi with a fixed prior N(0, 1); the others share the unknown scale s."""
 
     def at(self, xi: list[float]) -> tuple[list[float], list[float]]:
-        """b, a of y(k) = sum b_i u(k-i) - sum a_i y(k-i), of one length; u(k) acts before y(k)."""
+        """b, a of y(k) = sum b_i u(k-i) - sum a_i y(k-i), equally long; u(k) acts before y(k)."""
 
     def slopes(self, xi: list[float]) -> tuple[Array, Array]:
-        """Derivatives of b and a by each xi, both of shape (K, n + 1)."""
+        """Derivatives of b and of a by each xi, both of shape (K, n + 1)."""
 
 
 class PlantFamily:
     """G(z; xi) around a nominal G, the model.
 
-    uncertainty: relative prior deviation of its frequencies, damping and delay; 0: K = 0. memory:
-    samples after which the slowest stable mode has died out, within reason.
+    uncertainty: relative prior standard deviation of frequencies, damping and delay; with 0, K = 0.
+    memory: samples until the slowest stable mode has practically died out.
     """
 
     def __init__(self, model: TransferFunction, uncertainty: float) -> None:
@@ -52,25 +52,25 @@ class PlantFamily:
         moving &= (poles.imag != 0.0) | (poles.real >= 0.0)
         self.model, self.integrates = model, bool(integrators.any())
         self.memory = memory_of(max(abs(poles[moving]), default=0.0))
-        # Denominator of the poles that do not move, but for the first integrator.
+        # Denominator of the poles that are kept, except the first integrator, which may leak.
         rest = np.concatenate([poles[elsewhere & ~moving], poles[integrators][1:].round()])
         self._rest: list[float] = np.atleast_1d(np.real(np.poly(rest))).tolist()
         self._pairs, self._nominal = _sections(poles[moving])
         a = [x.real for x in self._stable(self._nominal)]
         self._gain, self._delay = sum(a), len(model.denominator) - len(b)
-        # Delay of slow motion in B and in A [samples].
+        # Delay of B and of A at low frequency [samples].
         of_b, of_a = (float(np.arange(len(x)) @ x) / (sum(x) or inf) for x in (b, a))
         late = max(self._delay + of_b - of_a, 1.0)
-        # Prior deviation and limit of what each xi moves: a leak of up to 0.1 a sample, a lag of 40
-        # samples, the width of what acts half a sample late, a factor of 20 on Omega and D.
+        # Prior std and limit of what each xi changes. Limits: a leak of 0.1 a sample,
+        # a lag of 40 samples, a factor of 20 on Omega and D. 0.125: acting half a sample late.
         self._scales = [
             *[(5e-3 * uncertainty, 0.1)] * self.integrates, (uncertainty * late, 40.0),
             (0.125, inf), *[(uncertainty, 3.0)] * len(self._nominal)] if uncertainty > 0.0 else []
-        # A leak says nothing of how wrong the rest of G is.
+        # The size of a leak says nothing about how wrong the rest of G is.
         self.count, self.leaks = len(self._scales), int(self.integrates and uncertainty > 0.0)
         shorter = np.poly1d([1.0, 1.0]) ** max(len(b) - 2, 0)
         wide = np.convolve(shorter * (b.sum() / shorter(1.0)), [1.0, -2.0, 1.0])
-        # B, and what it changes by with lag and width.
+        # B, and its derivatives by lag and width.
         self._taps: list[list[float]] = [
             padded(taps, max(len(b) + 1, 3)).tolist()
             for taps in (b, np.append(0.0, b) - np.append(b, 0.0), wide)]
@@ -89,7 +89,7 @@ class PlantFamily:
         return of_b, of_a
 
     def _coefficients(self, xi: Sequence[complex]) -> tuple[list[complex], list[complex]]:
-        """b and a at xi; beyond its limit an xi changes nothing more."""
+        """b and a at xi; an xi beyond its limit has no further effect."""
         moved = [scale * x if abs(scale * x.real) < limit else copysign(limit, x.real)
                  for x, (scale, limit) in zip(xi, self._scales, strict=True)]
         moved = moved or [0.0] * (2 + len(self._nominal))
@@ -102,13 +102,13 @@ class PlantFamily:
             gain * (x + (lag - whole) * move + width * wide)
             for x, move, wide in zip(*self._taps, strict=True)]
         a = _product(stable, self._rest, integrator or [1.0])
-        while not self.count and not b[-1]:  # the same length at every xi, where there are any
+        while not self.count and not b[-1]:  # trim, unless the length must be the same at all xi
             b.pop()
         length = max(len(a), len(b))
         return b + [0j] * (length - len(b)), a + [0j] * (length - len(a))
 
     def _stable(self, logs: Sequence[complex]) -> list[complex]:
-        """Denominator of the poles that may move."""
+        """Denominator of the poles that depend on xi, given logs of their parameters."""
         pairs = zip(logs[:2 * self._pairs:2], logs[1:2 * self._pairs:2], strict=True)
         a = [1.0 + 0j]
         for omega, damping in ((exp(x), exp(y)) for x, y in pairs):
@@ -130,19 +130,19 @@ class PlantFamily:
 
 
 def state_columns(a: list[float], count: int) -> Array:
-    """How outputs depend on the state before them, shape (count, order)."""
+    """Responses of y to each element of the state X before the record, shape (count, order)."""
     return shifted(lfilter([1.0], a, np.eye(1, count)[0]), len(a) - 1).T
 
 
 def sensitivities(family: Family, xi: list[float], u: Array, y: Array) -> Array:
-    """Derivatives of y by each xi, (..., K, N); u, y: input and output over A, (..., N)."""
+    """Derivatives of y by each xi, (..., K, N); u, y: input and output filtered by 1/A."""
     of_b, of_a = family.slopes(xi)
     taps = of_b.shape[1]
     return np.asarray(of_b @ shifted(u, taps) - of_a @ shifted(y, taps))
 
 
 def _sections(poles: NDArray[np.complex128]) -> tuple[int, list[float]]:
-    """Number of pairs; ln Omega, ln D of each, then ln of a real pole that is left over."""
+    """Number of pairs of poles; ln Omega, ln D of each, then ln of a real pole left over."""
     s = np.log(poles.astype(complex))
     pairs = [(abs(x), -x.real / abs(x)) for x in s if x.imag > 1e-9]
     real = sorted(-x.real for x in s if abs(x.imag) <= 1e-9)
@@ -154,7 +154,7 @@ def _sections(poles: NDArray[np.complex128]) -> tuple[int, list[float]]:
 
 
 def _product(*factors: Sequence[complex]) -> list[complex]:
-    """Of polynomials: for so few coefficients, faster than np.convolve."""
+    """Product of polynomials; with so few coefficients faster than np.convolve."""
     product = [1.0 + 0j]
     for factor in factors:
         out = [0j] * (len(product) + len(factor) - 1)

@@ -1,7 +1,7 @@
-"""Where to begin a fit: gaps and beginnings, by the evidence of all else in closed form.
+"""Global search for starting points of a fit: evidence over a grid of gaps and initial positions.
 
-For a gap g and a beginning p0, y is linear in the state, o, m, m xi, and m times what p0 is off by
-(to first order in both): one QR for each of some 200 hypotheses, over rows averaged to some 1,500.
+Given a gap g and an initial p0, y is to first order linear in X, o, m, m xi and m times the error
+of p0. So one QR gives the evidence of each of some 200 hypotheses; rows are averaged to some 1,500.
 """
 
 from math import inf, isfinite
@@ -18,7 +18,7 @@ from backlash_ros.core.plant.transfer_function import Array
 
 
 class Hypothesis(NamedTuple):
-    """A gap and a beginning, the slope that goes with them, and their evidence."""
+    """A gap, p0 and the slope fitted with them, and their evidence."""
 
     evidence: float
     gap: float
@@ -30,17 +30,17 @@ def search(
     family: Family, v: Array, y: Array, noise_std: float, widest: float, xi: Array,
     smallest: float = 0.01,
 ) -> tuple[list[Hypothesis], float]:
-    """Hypotheses, those likelier than with gaps beside theirs first, and the evidence of no motion.
+    """Hypotheses, up to three local maxima over the gap first, and the evidence of a constant u.
 
-    v, y: (N,), y nan where lost. widest: gap that is considered. xi: error of G (K,), around which
-    G is linearized. smallest: gap that is compared, over the largest (swing of v, or the widest).
+    v, y: (N,), y nan where lost. widest: largest gap considered. xi: error of G (K,) around which G
+    is linearized. smallest: smallest gap over the largest (swing of v, at most `widest`).
     """
     known, begins, (b, a) = np.isfinite(y), _bins(v), family.at(xi.tolist())
     readings = np.add.reduceat(known.astype(np.float64), begins)
     weights = (readings > 0.0) / np.sqrt(np.maximum(readings, 1.0))
 
     def averaged(columns: Array) -> Array:
-        """Columns (..., N) summed over bins and divided by the root of the readings in each."""
+        """Columns (..., N) summed over bins, over the square root of the number of readings there."""
         return np.asarray(np.add.reduceat(columns * known, begins, axis=-1) * weights)
 
     common = np.vstack([state_columns(a, len(v)).T, lfilter(b, a, np.ones(len(v)))])
@@ -48,23 +48,23 @@ def search(
     freedom = max(q.shape[0] - q.shape[1], 1)
 
     def rest(columns: Array) -> Array:
-        """Columns (..., R) without what state and o explain."""
+        """Columns (..., R) minus their projection on X and o."""
         return np.asarray(columns - (columns @ q) @ q.T)
 
     def value(squares: Array) -> Array:
-        """Evidence of what leaves these squares, noise integrated out."""
+        """Evidence with this residual sum of squares, the noise integrated out."""
         return np.asarray(-0.5 * freedom * np.log((squares + noise_std**2) / len(q)))
 
     y_rest = rest(averaged(np.where(known, y, 0.0)))
 
     def compared(gaps: Array) -> list[Hypothesis]:
-        """The best beginning of each gap."""
-        shares: Array = np.arange(5) / 4.0  # places of the beginnings within the gap
+        """The best p0 for each gap."""
+        shares: Array = np.arange(5) / 4.0  # positions of p0 within the gap
         g, k = np.repeat(gaps, len(shares)), family.count
         before = v[0] + np.tile(shares, len(gaps)) * g
         p = play(v, g, before)
         begun = np.logical_and.accumulate(p == p[:, :1], axis=1).astype(np.float64)
-        # xi changes no constant part of u: that keeps to o.
+        # Only motion of u depends on xi; its constant part belongs to o.
         move = lfilter([1.0], a, p - p[:, :1])
         y_over_a = lfilter([1.0], a, lfilter(b, [1.0], move))
         columns = rest(np.concatenate([
@@ -74,12 +74,12 @@ def search(
         target = np.broadcast_to(y_rest, (len(g), 1, len(y_rest)))
         stack = np.concatenate([columns, target], axis=1).transpose(0, 2, 1)
         r = np.asarray(np.linalg.qr(stack, mode='r'))
-        # In units of v.
+        # Standard deviation of the noise in units of v.
         noise = np.sqrt((r[:, -1, -1] ** 2 + noise_std**2) / freedom) \
             / (np.abs(r[:, 0, -1] / r[:, 0, 0]) + 1e-30)
         evidence = np.full(len(g), -inf)
-        for scale in (0.03, 0.3, 1.0) if k else (1.0,):  # of the error of G that are weighed
-            # p0 is anywhere within the gap.
+        for scale in (0.03, 0.3, 1.0) if k else (1.0,):  # values of s
+            # p0 may be anywhere within the gap.
             prior = np.column_stack([noise * 12.0**0.5 / g, *[noise / scale] * k])
             of_prior = prior[:, :, None] * np.eye(1 + k, 3 + k, 1)
             s = np.asarray(np.linalg.qr(np.concatenate([r, of_prior], axis=1), mode='r'))
@@ -93,7 +93,7 @@ def search(
 
     top = min(float(np.ptp(v)), widest)
     gaps: Array = np.append(1e-9 * top, np.geomspace(smallest * top, top, 32))
-    # The first is none at all. Of so many at once that memory holds them.
+    # The first is practically none. Evaluated in parts that fit into memory.
     parts = np.array_split(gaps, 1 + len(gaps) * len(v) * (1 + family.count) // 500_000)
     found = [h for part in parts for h in compared(part) if isfinite(h.evidence)]
     e = [-inf, *(h.evidence for h in found), -inf]
@@ -102,7 +102,7 @@ def search(
 
 
 def _bins(v: Array) -> NDArray[np.intp]:
-    """Where some 1,500 bins begin, half of them even over time and half over the motion of v."""
+    """First samples of some 1,500 bins, spread half evenly over time and half over motion of v."""
     count = len(v)
     if count <= ROWS:
         return np.arange(count)

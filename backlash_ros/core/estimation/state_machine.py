@@ -216,7 +216,7 @@ def _contradicts(
 
 
 def _most(least: float, count: float, rho: float) -> float:
-    """Largest mean square by chance of so many normalized residuals of this correlation, >= least."""
+    """Limit on the mean square of `count` scaled residuals: what chance explains, or `least`."""
     from scipy.special import chdtri  # where fits are made: 31 MB
 
     free = max(count / (1.0 + (count - 1.0) * rho), 1.0)

@@ -1,8 +1,8 @@
-"""What a fit lacks, told from its residuals: a load that coasts, a walk of u.
+"""Detects from residuals what the model lacks: a load that coasts, a random walk of u.
 
-A load that nothing holds in the gap runs on with the speed that it had when it left its side. That
-is one more column of the fit; its coefficient kappa is 0 where the load stays and 1 where nothing
-brakes it (C. R. Rao, Proc. Cambridge Philosophical Society 44 (1948)).
+A load that nothing holds in the gap coasts at the speed at which it left its side. This is tested
+as one more column of the fit, whose coefficient kappa is 0 if the load stays and 1 if nothing
+brakes it: a score test (C. R. Rao, Proc. Cambridge Philosophical Society 44 (1948)).
 """
 
 from dataclasses import replace
@@ -19,12 +19,12 @@ from backlash_ros.core.plant.transfer_function import Array
 
 
 def coasts(problem: Problem, fit: WindowFit, known: Array | None = None) -> bool:
-    """Whether residuals are correlated because the load runs on within the gap.
+    """Whether residuals are correlated because the load coasts within the gap.
 
-    known: m, c_r, c_l (3,) from before, for the fit of a load that coasts may have next to no gap.
+    known: earlier m, c_r, c_l (3,), tested as well: with coasting, a fit may find next to no gap.
     """
-    named = 8.0  # kappa over its deviation, as residuals are far from white
-    matters = 2e-3  # unexplained motion over the gap, as rounding of a slow motion leaves less
+    named = 8.0  # least kappa over its standard deviation; high, as residuals are far from white
+    matters = 2e-3  # least unexplained motion over the gap; quantization of slow motion leaves less
     if not (fit.m > 0.0 and fit.systematic and fit.unexplained > matters):
         return False
     if known is not None:
@@ -38,12 +38,12 @@ def coasts(problem: Problem, fit: WindowFit, known: Array | None = None) -> bool
 
 
 def _runs_on(problem: Problem, fit: WindowFit) -> float:
-    """kappa over its standard deviation, as if residuals were white; 0 for a small one."""
+    """kappa over its standard deviation for white residuals; 0 for a small kappa."""
     v, p = problem.v, problem.at(fit).p
-    beyond, speed = [0.0], 0.0  # how far a load that nothing brakes is from p
+    beyond, speed = [0.0], 0.0  # distance of a load that coasts freely from p
     for k, move in enumerate(np.diff(p).tolist(), 1):
         speed = move or speed
-        # From one side, where it starts anew, to the other.
+        # It starts anew from the side that moves it, and stops at the other.
         away = 0.0 if move else clamp(beyond[-1] + speed, v[k] - p[k], v[k] + fit.gap - p[k])
         beyond.append(away)
     b, a = problem.family.at(fit.xi)
@@ -58,19 +58,19 @@ def _runs_on(problem: Problem, fit: WindowFit) -> float:
 
 
 def with_walk(problem: Problem, f: WindowFit, least: float) -> WindowFit:
-    """The fit, or one with a larger walk of u if that explains correlated residuals."""
+    """The fit, or one with a larger random walk of u if that explains correlated residuals."""
     begin = replace(f.without_intervals, knots=np.zeros(0), walk_std=least)
     best = f if f.walk_std == least else problem.with_intervals(problem.fitted(begin))
     if not best.valid or not best.systematic:
         return best
     runs_on = _runs_on(problem, best) > settings.BY_CHANCE
-    for share in (0.005, 0.02, 0.08):  # of m times the gap, by which u may walk over the record
+    for share in (0.005, 0.02, 0.08):  # walk over the record, in units of m times the gap
         walk_std = share * f.m * f.gap / sqrt(len(problem.v))
         if walk_std > least:
             walks = replace(begin, walk_std=walk_std)
             g = problem.with_intervals(problem.fitted(walks, FIRST_STEPS))
             needed = 0.0 if best.walk_std > least else settings.FAR_BEHIND
-            # Correlated readings count as a first-order process, or as one if a load coasts.
+            # Fewer independent residuals: those of a first-order process; if a load coasts, one.
             rho = min(g.left.correlation, 0.999)
             fewer = g.inflation if runs_on else (1.0 + rho) / (1.0 - rho)
             if g.valid and g.evidence - best.evidence > needed * fewer:
