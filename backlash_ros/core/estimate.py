@@ -1,6 +1,6 @@
-"""Estimates of the backlash: their values, how far to trust them, and their file.
+"""Estimates of the backlash: values, status, and a file to save them to.
 
-With the file a controller that is restarted need not learn from nothing.
+With the file a restarted controller need not learn everything anew.
 """
 
 import json
@@ -17,13 +17,13 @@ NEEDED, DEVIATIONS = ('m', 'c_r', 'c_l', 'f'), ('std_m', 'std_c_r', 'std_c_l')
 
 
 class Status(IntEnum):
-    """How much an estimate may be trusted; the code stands in `controller/signals`."""
+    """How far an estimate can be trusted; published as a code in `controller/signals`."""
 
-    ACQUIRING = 0  # not enough known yet, the estimate still moves freely
-    TRACKING = 1  # consistent with the data and updated by them
-    NOT_EXCITED = 2  # frozen: v did not swing past the gap lately
+    ACQUIRING = 0  # not enough is known yet; the estimate may still change freely
+    TRACKING = 1  # consistent with the data, which update it
+    NOT_EXCITED = 2  # frozen: v has not crossed the gap lately
     NO_DATA = 3  # frozen: y is missing
-    INCONSISTENT = 4  # frozen: y does not follow from v through G and a backlash
+    INCONSISTENT = 4  # frozen: no backlash in front of G explains y
 
     @property
     def word(self) -> str:
@@ -32,7 +32,7 @@ class Status(IntEnum):
 
 @dataclass(frozen=True)
 class Estimate:
-    """m [u / v], c_r, c_l [v] and f of (3.2), and deviations, nan where the law has none."""
+    """m [u/v], c_r, c_l [v], f of (3.2) and standard deviations, nan if the law gives none."""
 
     m: float
     c_r: float
@@ -45,35 +45,35 @@ class Estimate:
 
     @property
     def learned(self) -> bool:
-        """Whether it comes from data: a first guess has no deviations."""
+        """Whether it was learned from data: a first guess has no standard deviations."""
         return not isnan(self.std_m)
 
 
 def worth_saving(estimate: Estimate) -> bool:
-    """Whether it was learned; a first guess is not, nor are constants that were given."""
+    """Whether it was learned, and is neither a first guess nor given constants."""
     return not was_given(estimate) and (estimate.learned or estimate.status == Status.TRACKING)
 
 
 def was_given(estimate: Estimate) -> bool:
-    """Whether the constants are taken as they are: no law that learns is sure of them."""
+    """Whether its constants were given: only then all standard deviations are 0."""
     return estimate.std_m == estimate.std_c_r == estimate.std_c_l == 0.0
 
 
 def save_estimate(path: Path, estimate: Estimate, p: Parameters) -> None:
-    """Write the file, complete or not at all; raises OSError."""
+    """Write the file, completely or not at all. Raises OSError."""
     values = {name: getattr(estimate, name) for name in (*NEEDED, *DEVIATIONS)}
     content = {
         'version': 1, 'key': _key(p),
-        # JSON has no nan.
+        # JSON cannot represent nan.
         'estimate': {name: None if isnan(value) else value for name, value in values.items()},
     }
     write_atomically(path, json.dumps(content, indent=1, allow_nan=False) + '\n')
 
 
 def load_estimate(p: Parameters) -> Estimate | None:
-    """What estimates.file holds, None where it is not to be loaded or not there yet.
+    """Read estimates.file; None if it is not to be loaded or does not exist yet.
 
-    Raises ParameterError for one that is broken or of another plant or law, `fixed` excepted.
+    Raises ParameterError if it is broken, or of another plant or law; law `fixed` takes any law's.
     """
     if not p.estimates.load:
         return None
@@ -116,7 +116,7 @@ def load_estimate(p: Parameters) -> Estimate | None:
 
 
 def _key(p: Parameters) -> dict[str, object]:
-    """What a saved estimate depends on, as JSON has it; a file for anything else is refused."""
+    """Parameters that a saved estimate depends on, as in JSON; other files are refused."""
     names = ('estimator.law', 'sample_period', 'plant.numerator', 'plant.denominator',
              'control.delay_samples')
     return {name: list(value) if isinstance(value := p[name], tuple) else value for name in names}

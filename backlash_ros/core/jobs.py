@@ -1,7 +1,7 @@
-"""Jobs that a loop has computed, at once or in a process of their own.
+"""Jobs that are computed for a loop, at once or in a worker process.
 
-A job is a pure function of what it is given. The loop submits one at a time to a channel, and polls
-for its result; neither waits for a job.
+A job is a pure function of its arguments. The loop submits one at a time to a channel and polls for
+its result; with a worker process neither of these calls waits.
 """
 
 import ctypes
@@ -22,48 +22,48 @@ from typing import IO, Any, NamedTuple
 
 Job = Callable[..., Any]
 
-LOST = 'lost'  # kind of the failure of a job whose worker died
+LOST = 'lost'  # kind of Failure if the worker died
 
 
 class Failure(NamedTuple):
-    """What comes of a job without a result: the class of its exception, LOST of a dead worker."""
+    """Why a job has no result: the class name of its exception, or LOST if the worker died."""
 
     kind: str
 
 
 class Channel:
-    """At most one job at a time. busy: whether there is one whose result nobody has polled yet."""
+    """Runs one job at a time. busy: whether a job is under way, or its result not polled yet."""
 
     def __init__(self, executor: 'Executor') -> None:
         self.busy = self.closed = False
-        self.result: Callable[[], Any] | None = None  # once it is there
+        self.result: Callable[[], Any] | None = None  # set once it is available
         self._executor = executor
 
     def submit(self, job: Job, *args: Any) -> None:
-        """Have job(*args) computed, where there is none under way.
+        """Have job(*args) computed; call only if not busy.
 
-        job: a function at the top level of a module, which changes none of its arguments.
+        job: a function at the top level of a module that does not modify its arguments.
         """
         self.busy = True
         self._executor.begin(self, job, args)
 
     def poll(self) -> Any:
-        """The result of the job, or its Failure, once it is finished; None before."""
+        """The result of the job, or a Failure, once it is finished; None until then."""
         if self.result is None:
             return None
         result, self.result, self.busy = self.result, None, False
         return result()
 
     def close(self) -> None:
-        """Nobody waits for the result of its job any more."""
+        """Abandon the job: its result is no longer wanted."""
         self.closed = True
 
 
 class Executor:
-    """Computes jobs for any number of channels, each when it is submitted.
+    """Computes each job at once when it is submitted, for any number of channels.
 
-    So simulations, lockstep and tests give the same numbers whenever they are made. restarts: how
-    many workers have died so far, where there are any.
+    This makes simulation, lockstep and tests reproducible. restarts: number of workers that have
+    died so far, if there are workers.
     """
 
     restarts = 0
@@ -75,21 +75,21 @@ class Executor:
         result: Any
         try:
             result = job(*args)
-        except Exception as error:  # whatever it is: the loop goes on without this result
+        except Exception as error:  # of any kind: the loop goes on without this result
             result = Failure(type(error).__name__)
         channel.result = lambda: result
 
     def close(self) -> None:
-        """End it; jobs that are under way are dropped."""
+        """Stop; jobs that are under way are dropped."""
 
 
 class WorkerExecutor(Executor):
-    """Computes jobs in a worker process, which begins with the first channel.
+    """Computes jobs in a worker process, started when the first channel is opened.
 
-    One that dies is replaced, and only the job that was under way is lost. It ends with its parent,
-    however that ends, and imports nothing of that program but what jobs need. preload: modules that
-    it imports at its start, not with its first job. loops: how many it works for. worker: the
-    process; pickled jobs go to its standard input, pickled results come from its standard output.
+    If the worker dies it is replaced, and only the job under way is lost. It ends with its parent,
+    however that ends, and imports only what jobs need. preload: modules to import at its start, not
+    with the first job. loops: number of loops it serves, which sets its share of a processor.
+    worker: the process; jobs are pickled to its standard input, results from its standard output.
     """
 
     def __init__(self, preload: Sequence[str] = (), loops: int = 1) -> None:
@@ -119,8 +119,8 @@ class WorkerExecutor(Executor):
             self._thread.join(0.1)
 
     def _exchange(self) -> None:
-        """Have jobs done one by one."""
-        deaths = 0  # in a row without an answer
+        """Pass jobs to the worker one by one; runs in a thread of its own."""
+        deaths = 0  # of workers in a row, without an answer between
         for channel, job in iter(self._submitted.get, None):
             asked = False
             while not (asked or channel.closed or self._closed.is_set()):
@@ -131,22 +131,22 @@ class WorkerExecutor(Executor):
                     _send(self.worker.stdin, job)
                     asked = True
                     body = pickle.load(self.worker.stdout)
-                    # Not here, where it would keep the loop waiting.
+                    # Unpickled in poll: in this thread it would block the loop at any time.
                     channel.result, deaths = partial(pickle.loads, body), 0
-                # Of a start: no memory, or no more processes.
+                # OSError also if a worker cannot be started: no memory, or too many processes.
                 except (OSError, EOFError, pickle.UnpicklingError):
                     self._end_worker()
                     self.restarts, deaths = self.restarts + 1, deaths + 1
                     if asked:
                         channel.result = partial(Failure, LOST)
-                    if deaths > 1:  # like the one before it
+                    if deaths > 1:  # as the previous one did
                         self._closed.wait(min(0.1 * 2.0 ** min(deaths, 7), 10.0))
         self._end_worker()
 
     def _end_worker(self) -> None:
         worker, self.worker = self.worker, None
         if worker is not None:
-            with suppress(OSError), worker:  # of what could not be sent any more
+            with suppress(OSError), worker:  # closing flushes what could not be sent
                 worker.kill()
 
 
@@ -155,23 +155,23 @@ def _start(preload: tuple[str, ...], loops: int) -> subprocess.Popen[bytes]:
         f'serve({os.getpid()}, {preload!r}, {loops})'
     process = subprocess.Popen(
         [sys.executable, '-c', code], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-        # In a session of its own it gets no Ctrl-C, not even while it starts, and what it takes of
-        # a processor is not taken from the share of the loop.
+        # A session of its own: no Ctrl-C reaches it, even while it starts, and its processor time
+        # does not count against the share of the loop.
         start_new_session=True,
-        # A second thread of a fit would take the core on which the loop runs.
+        # A second thread for linear algebra would occupy the core on which the loop runs.
         env={**os.environ, 'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'},
     )
-    # From here, so that it holds for its imports as well; a loop in real time passes that on.
+    # Set from here, to hold during its imports as well: it inherits a real-time loop's policy.
     os.sched_setscheduler(process.pid, os.SCHED_OTHER, os.sched_param(0))
     niceness = os.getpriority(os.PRIO_PROCESS, 0) + 5
     os.setpriority(os.PRIO_PROCESS, process.pid, niceness)
-    with suppress(OSError):  # a kernel that does not share the processors between sessions
+    with suppress(OSError):  # kernel without autogroup scheduling
         Path(f'/proc/{process.pid}/autogroup').write_text(str(niceness))
     return process
 
 
 def _send(stream: IO[bytes], body: bytes) -> None:
-    """Send what was pickled, as one object to pickle: so it is read as a whole."""
+    """Send pickled bytes, pickled once more as one object, so that they are read as a whole."""
     pickle.dump(body, stream, -1)
     stream.flush()
 
@@ -180,26 +180,26 @@ def _send(stream: IO[bytes], body: bytes) -> None:
 
 
 def end_with_parent() -> None:
-    """Let the kernel end this process with the thread that started it, whatever it does then."""
+    """Have the kernel kill this process as soon as the thread that started it ends."""
     ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
 
 
 def serve(parent: int, preload: Sequence[str], loops: int) -> None:
-    """Compute jobs that come through the standard input, until it or the parent ends."""
+    """Compute jobs from the standard input until it is closed or the parent ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)
     end_with_parent()
     if os.getppid() != parent:
-        return  # it has ended before that
+        return  # the parent ended before that call
     results = os.fdopen(os.dup(1), 'wb')
-    os.dup2(2, 1)  # what a job prints is no result
+    os.dup2(2, 1)  # keep what jobs print out of the results
     for name in preload:
         import_module(name)
-    # Where nothing explains what a plant does, one search follows the other. On average they get
-    # this share of a processor for each loop, so that no command is late for them.
+    # If nothing explains the plant, one search follows another. On average they get this share of a
+    # processor for each loop, so that they delay no command.
     share, burst_s = 0.25 * loops, 5.0
     credit_s, since = burst_s, time.monotonic()
-    with suppress(EOFError, pickle.UnpicklingError):  # nobody sends another one
+    with suppress(EOFError, pickle.UnpicklingError):  # no more jobs
         while True:
             job = pickle.load(sys.stdin.buffer)
             began = time.process_time()
@@ -211,7 +211,7 @@ def serve(parent: int, preload: Sequence[str], loops: int) -> None:
 
 
 def _result_of(job: bytes) -> bytes:
-    """The pickled result of a job, or Failure; also where job or result cannot be pickled."""
+    """The pickled result of a pickled job, or a Failure, also if pickling itself fails."""
     try:
         function, args = pickle.loads(job)
         return pickle.dumps(function(*args), -1)

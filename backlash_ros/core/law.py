@@ -1,4 +1,4 @@
-"""What every law offers: estimates of the backlash, the state of G, and a report of its work."""
+"""The interface of every law: estimates of the backlash, the state of G, a report on its work."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,16 +14,16 @@ from backlash_ros.core.plant.transfer_function import Array, StateModel
 
 
 class Interval(NamedTuple):
-    """What the controller did between two samples: v was applied, y_m and u_d led to it."""
+    """What the controller applied from sample to sample: v, and the y_m and u_d that led to it."""
 
     v: float
     y_m: float
     u_d: float
-    other: float = nan  # v that may have been applied instead, nan for no doubt
+    other: float = nan  # v that may have acted instead, nan if there is no doubt
 
 
 class OutOfBounds(NamedTuple):
-    """A quantity, as its bound is named, that was found beyond it."""
+    """An estimate outside its bounds: name of the bound, estimated value, bounds."""
 
     name: str
     value: float
@@ -32,31 +32,31 @@ class OutOfBounds(NamedTuple):
 
 @dataclass(frozen=True)
 class LawReport:
-    """What a law knows of its own work; the defaults are those of a law that does not learn it."""
+    """A law's report on its own work; the defaults are for laws that cannot tell."""
 
-    noise_ratio: float = nan  # standard deviation of the noise on y, over the configured one
-    unexplained: float = nan  # motion of u that no backlash and no G explains, over m times the gap
-    coasts: bool = False  # whether no estimate is better because the load runs on within the gap
-    unconfirmed: bool = False  # whether samples do not confirm yet what was known before the run
-    wrong_sign: bool = False  # whether there is no estimate because y moves against v
-    undecided: bool = False  # whether there is none as several gaps explain y alike
-    forbidden: OutOfBounds | None = None  # what keeps a good estimate from being published
-    waiting: int = 0  # samples that no fit has taken in yet
-    overdue: int = 0  # samples since the fit that is under way was due
+    noise_ratio: float = nan  # learned over configured std of the noise on y
+    unexplained: float = nan  # unexplained motion of u over m times the gap
+    coasts: bool = False  # whether the load coasts in the gap, which spoils estimates
+    unconfirmed: bool = False  # whether samples have yet to confirm an earlier estimate
+    wrong_sign: bool = False  # whether y moves against v, so that there is no estimate
+    undecided: bool = False  # whether several gaps explain y alike, so that there is none
+    forbidden: OutOfBounds | None = None  # why a good estimate is not published
+    waiting: int = 0  # samples that no fit includes yet
+    overdue: int = 0  # samples since the fit under way was due
     outliers: int = 0  # readings rejected so far
-    reattributed: int = 0  # intervals so far over which another v acted than the one commanded
+    reattributed: int = 0  # intervals so far in which another v acted than commanded
     failed_fits: int = 0  # fits so far without a result
 
 
 class Law:
-    """Learns (m, c_r, c_l), and f where it adapts it, from v and y alone.
+    """Base class: learns (m, c_r, c_l), and f if the law adapts it, from v and y alone.
 
-    Laws inherit from here what they do not do themselves.
+    The methods here are defaults for laws without that capability.
     """
 
-    RETUNED: ClassVar[tuple[str, ...]] = ()  # names of the parameters that `retune` takes up
+    RETUNED: ClassVar[tuple[str, ...]] = ()  # names of the parameters that `retune` updates
     estimate: Estimate
-    adapting: bool = True  # whether it learns; otherwise it follows the state of G alone
+    adapting: bool = True  # whether it learns, or only tracks the state of G
 
     @property
     def x_hat(self) -> Sequence[float] | Array:
@@ -65,40 +65,40 @@ class Law:
 
     @property
     def x_cov(self) -> Array | None:
-        """Covariance of x_hat, shape (n, n); None where there is none."""
+        """Covariance of x_hat, shape (n, n); None if not known."""
         return None
 
     def update(self, y: float | None, interval: Interval) -> None:
-        """Take in y(k), None if it was lost, and what was applied from k-1 to k."""
+        """Process y(k), None if it was lost, and what was applied from k-1 to k."""
 
     def refine(self) -> None:
-        """Do what the command of this sample need not wait for."""
+        """Do the work that the command of this sample need not wait for."""
 
     @property
     def u_hat(self) -> float:
-        """Newest reconstruction of u; nan where there is none."""
+        """Newest reconstruction of u; nan if there is none."""
         return nan
 
     @property
     def innovation(self) -> float:
-        """y(k) minus its prediction from the samples before; nan where y(k) was lost."""
+        """y(k) minus its prediction from the samples before; nan if y(k) was lost."""
         return nan
 
     @property
     def learned_model(self) -> StateModel | None:
-        """The G behind the newest estimate; None for a law that learns no G."""
+        """The G that belongs to the newest estimate; None for a law that does not learn G."""
         return None
 
     @property
     def proposal(self) -> StateModel | None:
-        """A better G than that of x_hat, of whatever order; None if none is new."""
+        """A better G than that of x_hat, possibly of another order; None if there is no new one."""
         return None
 
     def adopt(self, model: StateModel) -> None:
-        """Give x_hat in the coordinates of this model from now on."""
+        """Use this model from now on: x_hat is in its coordinates."""
 
     def response_std(self, z: NDArray[np.complex128]) -> Array:
-        """Relative deviation of the response of `learned_model` at z (M,), nan for none."""
+        """Relative std of the response of `learned_model` at z (M,), nan if not known."""
         return np.full(len(z), nan)
 
     @property
@@ -106,7 +106,7 @@ class Law:
         return LawReport()
 
     def retune(self, p: Parameters) -> None:
-        """Take up new values of the parameters RETUNED; what was learned stays."""
+        """Apply new values of the parameters in RETUNED; what was learned is kept."""
 
     def close(self) -> None:
-        """Give back what it holds elsewhere: its record in a worker, and a fit under way."""
+        """Release its resources: a fit under way in a worker is dropped."""

@@ -1,4 +1,4 @@
-"""What a whole record says, G being roughly known, by the fit of the loop over all its samples."""
+"""Fits a backlash to a whole record with a roughly known G, by the same fit as in the loop."""
 
 from collections.abc import Mapping, Sequence
 from math import inf, nan
@@ -17,11 +17,11 @@ from backlash_ros.core.window import Window
 
 
 class RecordFit(NamedTuple):
-    """What a record says. nominal, model: G as given and as learned, the same where data do not
-    speak for another one. doubts, against, outside: why it is of no use: of the values, y that
-    moves against v, bounds. estimates: m (negative where y moves against v), c_r, c_l with their
-    deviations. fit: of -G where m is negative. predicted: share of the motion of y. reversals: of
-    the play. margins: log-likelihood by which each delay falls behind."""
+    """Result of fitting a record. nominal, model: G as given and as learned (the same unless the
+    data favour another). doubts, against, outside: why the result is unusable: imprecise values, y
+    moves against v, bounds violated. estimates: (value, standard deviation) of m (negative if y
+    moves against v), c_r, c_l. fit: of -y if m is negative. predicted: share of the motion of y
+    that is explained. reversals: of the play. margins: log-evidence that each delay falls behind."""
 
     nominal: TransferFunction
     model: TransferFunction
@@ -49,11 +49,11 @@ class RecordFit(NamedTuple):
 
     @property
     def usable(self) -> bool:
-        """Whether m, c_r and c_l are known as well as the loop wants to know them."""
+        """Whether m, c_r and c_l are known well enough: there is no reason against it."""
         return not self.reasons
 
     def error_of_model(self, frequencies: Sequence[float]) -> Array:
-        """|G_learned / G_nominal - 1| at frequencies (N,) [rad/sample], but for that at rest."""
+        """|G_learned / G_nominal - 1| at frequencies (N,) [rad/sample]; both agree at rest."""
         z = np.exp(1j * np.asarray(frequencies, dtype=float))
         return np.asarray(np.abs(self.model.response(z) / self.nominal.response(z) - 1.0))
 
@@ -62,11 +62,11 @@ def fit_record(
     v: Array, y: Array, model: TransferFunction | StateModel, uncertainty: float,
     noise_std: float, bounds: Bounds | None = None, delays: Sequence[int] = (0,),
 ) -> RecordFit:
-    """Fit v (N,), applied from k to k+1, and y (N,) at k, nan where lost.
+    """Fit a backlash and G to v (N,), applied from k to k+1, and y (N,) at k, nan where lost.
 
-    model: G without delay of v. uncertainty: relative spread of its time constants, damping and
-    delay, 0 where it is exact. noise_std: of y, a first guess. delays: of v [samples], of which the
-    likeliest is taken. Raises ValueError for arrays and delays that are none.
+    model: G without the delay of v. uncertainty: relative std of its time constants, damping and
+    delay, 0 if it is exact. noise_std: of y, a first guess. delays: candidates for the delay of v
+    [samples]; the likeliest is taken. Raises ValueError for invalid arrays or delays.
     """
     v, y = np.asarray(v, dtype=float), np.asarray(y, dtype=float)
     check_record(v, y)
@@ -92,7 +92,7 @@ def fit_record(
 
 
 def _fitted(setup: explanations.Setup, v: Array, y: Array, bounds: Bounds | None) -> RecordFit:
-    """Fit v (N,) and y (N,) after it, or -y where y moves against v."""
+    """Fit v (N,) and the y (N,) after it, or -y if y moves against v."""
     family, swing = setup.family, float(np.ptp(v))
     record = Window(0, v, y, np.full(len(v), nan))
     fit, sign = explanations.afresh(setup, record), 1.0
@@ -115,7 +115,7 @@ def _fitted(setup: explanations.Setup, v: Array, y: Array, bounds: Bounds | None
         f'v crossed the gap {reversals} times; {wanted} at least are needed to tell both '
         'crossings': reversals < wanted,
         f'm is known to {stds[0]:.2g} only': not stds[0] <= settings.STD_SLOPE * fit.m,
-        # A gap of 0 is known to 1 % of the swing.
+        # Even a gap of 0 counts as known if its standard deviation is below 1 % of the swing.
         f'the gap, about {fit.gap:.4g}, is known to {fit.gap_std:.2g} only':
             not fit.gap_std <= max(settings.STD_GAP * fit.gap, 0.01 * swing),
     }

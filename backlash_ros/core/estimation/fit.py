@@ -118,7 +118,7 @@ class Problem:
 
         most_scale: limit of s. held, begun: keep the gap, or p0. Raises LinAlgError if not finite.
         """
-        from scipy.linalg.lapack import dtrtri  # where fits are made: 31 MB
+        from scipy.linalg.lapack import dtrtri  # late: 31 MB that only fits need
 
         r, run = self._triangle(f, held, begun), self.at(f)
         if not np.isfinite(r).all():

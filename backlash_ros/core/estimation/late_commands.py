@@ -87,7 +87,7 @@ def weighed(
 ) -> tuple[Window, WindowFit, frozenset[int]]:
     """Choose between the swapped record and the one that was sent, as a wrong fit makes commands
     look late. Returns record, fit and swapped samples; the other fit adds to the spread."""
-    from scipy.special import betaln  # where fits are made: 31 MB
+    from scipy.special import betaln  # late: 31 MB that only fits need
 
     late, open_ = len(record.places(swapped)), np.isfinite(record.other).sum()
     rival = afresh(setup, record.swapped(swapped), None, older, also=fit) if late else None

@@ -59,7 +59,7 @@ def likelihood(r: Array, noise_std: float, step: float, weights: Array) -> Likel
 
 
 def _of_interval(r: Array, half: float) -> tuple[Array, Array, Array]:
-    from scipy.special import log_ndtr  # where fits are made: 31 MB
+    from scipy.special import log_ndtr  # late: 31 MB that only fits need
 
     upper, lower = r + half, r - half
     # From the smaller tail: a difference of two numbers near 1 would be lost to rounding.
@@ -225,7 +225,7 @@ class WindowFit:
 
 def agree(one: Array, other: Array, cov: Array) -> bool:
     """Whether vectors (n,) agree by a chi-square test; cov: of their difference (n, n)."""
-    from scipy.special import chdtri  # where fits are made: 31 MB
+    from scipy.special import chdtri  # late: 31 MB that only fits need
 
     apart = one - other
     squares = float(apart @ np.linalg.lstsq(cov, apart, rcond=1e-14)[0])

@@ -217,7 +217,7 @@ def _contradicts(
 
 def _most(least: float, count: float, rho: float) -> float:
     """Limit on the mean square of `count` scaled residuals: what chance explains, or `least`."""
-    from scipy.special import chdtri  # where fits are made: 31 MB
+    from scipy.special import chdtri  # late: 31 MB that only fits need
 
     free = max(count / (1.0 + (count - 1.0) * rho), 1.0)
     return max(least, float(chdtri(free, 1e-5)) / free)

@@ -1,1 +1,1 @@
-"""Laws to compare with: LMS, the law as printed (3.11), the gradient, and fixed constants."""
+"""Laws for comparison: LMS, the law as printed (3.11), gradient, and fixed constants."""

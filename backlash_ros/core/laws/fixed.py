@@ -1,4 +1,4 @@
-"""No learning: a backlash measured by hand, or none, is taken as it is."""
+"""A law that does not learn: a backlash measured by hand, or none, is used as it is."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from backlash_ros.core.plant.transfer_function import Array, StateModel
 
 
 class FixedBacklash(Law):
-    """Keeps its estimates; a Kalman filter follows the state of G and a slow disturbance d of u.
+    """Keeps its estimate; a Kalman filter tracks the state of G and a slow disturbance d of u.
 
-    noise_std: of y; where the innovations show more white noise, that counts. doubt: how much d
-    may move per sample, as a share of the motion of u that the constants predict.
+    noise_std: of y; if the innovations show more white noise, that is used instead. doubt: std of
+    the change of d per sample, over the change of u that the constants predict.
     """
 
     adapting = False
@@ -58,7 +58,7 @@ class FixedBacklash(Law):
         return self._p[:-1, :-1]
 
     def predicted(self, u: float) -> float:
-        """y(k+1) with this u from the backlash."""
+        """Prediction of y(k+1) if the backlash puts out this u."""
         return self._model.c * float(self._transition[0] @ self._x + self._model.b[0] * u)
 
     def update(self, y: float | None, interval: Interval) -> None:
@@ -71,7 +71,7 @@ class FixedBacklash(Law):
         self.innovation = nan
         if y is not None:
             if not self._started:
-                # A prior that is wide beside the first output and the noise.
+                # A prior that is wide compared with the first output and the noise.
                 x_scale = 1e3 * (abs(y) + self._noise_var**0.5)
                 p[:-1, :-1] += x_scale**2 * np.eye(len(x) - 1)
                 self._started = True

@@ -1,17 +1,17 @@
-"""The adaptation of Tao and Kokotović: a normalised gradient on the products.
+"""The adaptive law of Tao and Kokotović: a normalized gradient for the products.
 
-With theta = (m, m c_r, m c_l) and phi = (v, -1{right}, -1{left}), u = theta' phi, the plant
-behind the filters of pole_placement.py answers to the true theta with
+With theta = (m, m c_r, m c_l) and phi = (v, -1{right}, -1{left}), u = theta' phi. Seen through the
+filters of pole_placement.py, the plant with the true theta satisfies
 
     y + B R/(Lambda A_m) y = W u
 
-so that with zeta = W phi the estimation error is linear in the parameter error:
+so that, with zeta = W phi, the estimation error eps is linear in the parameter error:
 
     eps = y + B R/(Lambda A_m) y - theta_hat' zeta = (theta - theta_hat)' zeta
     theta_hat(k+1) = theta_hat(k) + step P zeta eps / (zeta' P zeta + xi^2/u_s^2 + a^2)
 
 with xi = theta_hat' zeta - W u_d. P = diag(1/v_s^2, 1, 1); v_s^2, u_s^2 and 10 a^2
-are means of v^2, u_d^2 and zeta' P zeta; a is at least 10 deviations of the noise on y over u_s.
+are means of v^2, u_d^2 and zeta' P zeta; a is at least 10 / u_s times the std of the noise on y.
 
 Reference: G. Tao, P. V. Kokotović, Adaptive Control of Systems with Actuator and Sensor
 Nonlinearities, Wiley 1996.
@@ -32,19 +32,19 @@ from backlash_ros.core.plant.transfer_function import Array
 
 @dataclass
 class Means:
-    """Running means of v^2, u_d^2 and zeta' P zeta, by which the adaptation is normalised."""
+    """Running means of v^2, u_d^2 and zeta' P zeta, which normalize the adaptation."""
 
     v_square: float = 0.0
     u_square: float = 0.0
     size: float = 0.0  # of zeta' P zeta
-    samples: int = 0  # so far; MEMORY of them count
+    samples: int = 0  # so far; weights fade over MEMORY of them
 
 
 class GradientEstimator(Law):
-    """Learns (m, m c_r, m c_l) from y behind the filters of the four-block loop.
+    """Learns (m, m c_r, m c_l) from y through the filters of the four-block loop.
 
-    step: 0 < step < 2. noise_std: of y. Where y moves against v nothing is learned.
-    innovation: y(k) minus what was expected of it. u_hat: of the estimate on the line in use.
+    step: gain, 0 < step < 2. noise_std: of y. While y moves against v, nothing is learned.
+    innovation: y(k) minus its prediction. u_hat: u by the estimate, on the line in use.
     """
 
     innovation, u_hat = nan, 0.0
@@ -55,10 +55,10 @@ class GradientEstimator(Law):
         self.estimate, self.step = initial, step
         self._bounds, self._noise_square = bounds, (10.0 * noise_std) ** 2
         self._agreement, self._means = Agreement(), Means()
-        # W of phi and of u_d, and what returns of y, each with its state in the observer form.
+        # Filters W for phi and u_d, and the one for y, each with its state in observer form.
         self._filters = [(model, [0.0] * model.order) for model in (
             *[blocks.disturbance] * 4, blocks.returned)]
-        self._y = 0.0  # the newest one, or what was expected of it
+        self._y = 0.0  # newest y, or its prediction
         self._phi: Array = np.zeros(3)
 
     def update(self, y: float | None, interval: Interval) -> None:
@@ -96,7 +96,7 @@ class GradientEstimator(Law):
         self.estimate = self._agreement.judged(new, (*zeta.tolist(), y + returned))
 
     def _engaged(self, interval: Interval, used: Estimate) -> Array:
-        """phi of the line on which v lies; between lines that of before."""
+        """phi for the line on which v lies; between the lines, the previous phi."""
         v, line = interval.v, interval.u_d / used.m
         near = 1e-9 * (abs(v) + abs(line))
         right, left = abs(v - line - used.c_r) <= near, abs(v - line - used.c_l) <= near

@@ -1,12 +1,12 @@
-"""u from y alone, and whether estimates agree with it.
+"""Reconstructs u from y alone, and checks whether estimates agree with it.
 
 A fixed-lag Kalman smoother of a random walk u(k+1) = u(k) + w in front of G. Looking back makes the
 inversion stable: an unstable zero z0 is inverted backwards in time, where it decays like |z0|^-lag.
 Reference: B. D. O. Anderson, J. B. Moore, Optimal Filtering, Prentice-Hall 1979, section 7.3.
 
-Whether estimates of these laws, which have no deviations, agree with what was measured lately: u,
-or what is made of it linearly, is t = theta' phi for the true theta = (m, m c_r, m c_l). With
-R = E{phi phi'} over many samples, and phi scaled to E{phi_i^2} = 1, the estimates may be wrong by
+Estimates of these laws have no standard deviations; they are checked against recent samples: u, or
+a linear function of it, is t = theta' phi for the true theta = (m, m c_r, m c_l). With
+R = E{phi phi'} over many samples, and phi scaled to E{phi_i^2} = 1, the error of theta_hat obeys
 
     |theta - theta_hat|^2 <= E{(t - theta_hat' phi)^2} / (smallest eigenvalue of R)
 """
@@ -22,18 +22,18 @@ from backlash_ros.core.parameters import ParameterError
 from backlash_ros.core.plant.numerics import riccati
 from backlash_ros.core.plant.transfer_function import Array, StateModel, TransferFunction
 
-# Square of a signal below which it counts as none. Its inverse, times the square of any
-# measurement, still is a number.
+# Square of a signal below which it counts as zero. Its inverse, times the square of any
+# measurement, does not overflow.
 LEAST_SQUARE = 1e-240
-MEMORY = 200  # samples over which means are taken, with weights that fade
-LEAST_SAMPLES, EVERY = 100, 20  # before the first judgement, and from one to the next
+MEMORY = 200  # samples over which means are taken, with fading weights
+LEAST_SAMPLES, EVERY = 100, 20  # before the first check, and from one to the next
 
 
 class InputReconstruction:
     """Fixed-lag smoother: u_hat(k - lag) from y(..k).
 
-    noise_std: of y, of which a share `smoothed` is smoothed away. std: of u_hat while no sample is
-    lost. Raises ParameterError, also where so much noise leaves nothing but rounding.
+    noise_std: of y; the smoother assumes the fraction `smoothed` of it. std: of u_hat while no
+    sample is lost. Raises ParameterError, also if the noise is too large for a finite result.
     """
 
     def __init__(
@@ -46,15 +46,15 @@ class InputReconstruction:
         state = StateModel(model)
         n = state.order
         # y is scaled so that a typical step of u, of size 1, shows in it with size 1: the median of
-        # |G W| on the unit circle, W = 1/(z - 1). The least noise that is assumed is a share of the
-        # weakest response, which counts as no weaker than 1e-4 of the typical one.
+        # |G W| on the unit circle, W = 1/(z - 1). The noise assumed is at least a fraction of the
+        # weakest response, and that at least 1e-4 of the typical one.
         z = np.exp(1j * np.linspace(0.01, np.pi, 200))
         response = np.abs(model.response(z) / (z - 1.0))
         self._scale, self._c = float(np.median(response)), state.c
         weakest = max(float(response.min()) / self._scale, 1e-4)
         noise = max(smoothed * noise_std / self._scale, 1e-3 * weakest)
         self._noise = noise * noise  # inf where ** would raise
-        # z = [x(k), u(k), u(k-1) .. u(k-lag)], from k-1 to k before y(k).
+        # Transition of z = [x(k), u(k), u(k-1) .. u(k-lag)] from k-1 to k, before y(k).
         self._step = np.zeros((n + 1 + lag, n + 1 + lag))
         self._step[:n, :n], self._step[:n, n] = state.a, state.b / self._scale
         self._step[n, n] = 1.0
@@ -69,7 +69,7 @@ class InputReconstruction:
                 'estimator.output_noise_std', noise_std, 'is so large that y says nothing of u',
                 'give the standard deviation of the noise on y, in the unit of y',
             )
-        # While no sample is lost, prediction and correction are one map.
+        # While no sample is lost, prediction and correction are one constant linear map.
         by_z = np.append(-self._c * self._step[0], 1.0)  # innovation, from z and y
         self._steady = np.vstack([np.outer(gain, by_z), by_z])
         self._steady[:-1, :-1] += self._step
@@ -78,11 +78,11 @@ class InputReconstruction:
         self._since_loss = 4 * lag
 
     def _stationary(self) -> Array:
-        """Covariance of z before a measurement when no sample was ever lost."""
+        """Stationary covariance of z before a measurement, with no sample lost."""
         unit, step = np.eye(len(self._step)), self._step
         process, output = np.diag(unit[-1 - self.lag]), self._c * unit[0]
         p = riccati(step.T, output / sqrt(self._noise), process)
-        for _ in range(100):  # filtering takes out what rounding has left there for little noise
+        for _ in range(100):  # filter steps remove rounding errors that matter with little noise
             gain = p @ output / (output @ p @ output + self._noise)
             rest = unit - np.outer(gain, output)
             p = step @ (rest @ p @ rest.T + self._noise * np.outer(gain, gain)) @ step.T + process
@@ -102,7 +102,7 @@ class InputReconstruction:
 
     @property
     def ready(self) -> bool:
-        """Whether the start is forgotten and u_hat about as good as without lost samples."""
+        """Whether the initial transient is over and lost samples have not spoilt u_hat."""
         return self.samples > 2 * self.lag and self._covariance.item(-1) <= 4.0 * self.std**2
 
     @property
@@ -111,7 +111,7 @@ class InputReconstruction:
         return np.asarray(self._z[:-2 - self.lag] * self._scale)
 
     def update(self, y: float | None) -> float:
-        """Take in y(k), None if it was lost, and return u_hat(k - lag)."""
+        """Process y(k), None if it was lost, and return u_hat(k - lag)."""
         self.samples += 1
         self._since_loss = 0 if y is None else self._since_loss + 1
         # Samples after a lost one until the covariance is stationary again.
@@ -130,7 +130,7 @@ class InputReconstruction:
         return self.u_hat
 
     def _corrected(self, p: Array) -> tuple[Array, Array]:
-        """The gain for a measurement after this covariance, and the covariance with it."""
+        """Kalman gain for a measurement with prior covariance p, and the covariance after it."""
         gain: Array = p[:, 0] * (self._c / (self._c**2 * p[0, 0] + self._noise))
         return gain, p - np.outer(gain, self._c * p[0])
 
@@ -141,23 +141,23 @@ class InputReconstruction:
 
 
 class Agreement:
-    """Means of the products of phi and t, by which estimates are judged.
+    """Judges estimates by means of the products of phi and t.
 
-    status: TRACKING while no theta that explains the samples differs from the estimate that was
-    judged last, nor this one from the newest, by more than a tenth of what the crossings make of t;
-    INCONSISTENT where the samples ask for a negative slope; ACQUIRING otherwise.
+    status: TRACKING while neither a theta that explains the samples, nor the newest estimate,
+    differs from the one judged last by more than a tenth of the crossings' contribution to t;
+    INCONSISTENT if the samples require a negative slope; ACQUIRING otherwise.
     """
 
     def __init__(self) -> None:
         self.status = Status.ACQUIRING
         self._samples = 0
-        self._rows: list[Sequence[float]] = []  # (phi, t) since the means were taken
+        self._rows: list[Sequence[float]] = []  # (phi, t) since the means were last updated
         self._products = np.zeros((4, 4))  # means of (phi, t)(phi, t)'
-        # Products judged last, the weights of their errors, and the largest sum of squares.
+        # Products judged last, weights of their errors, largest weighted sum of squares allowed.
         self._judged, self._weights, self._most = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0
 
     def judged(self, new: Estimate, row: Sequence[float]) -> Estimate:
-        """The estimate with its status, after the three elements of phi, and t, of this sample."""
+        """The estimate with its status. row: the three elements of phi, and t, of this sample."""
         theta = new.m, new.m * new.c_r, new.m * new.c_l
         self._rows.append(row)
         if len(self._rows) == EVERY:
@@ -179,14 +179,14 @@ class Agreement:
             return Status.ACQUIRING
         eigenvalues, vectors = np.linalg.eigh(self._products[:3, :3] / np.outer(size, size))
         least, largest = float(eigenvalues[0]), float(eigenvalues[-1])
-        # No more than the rounding of the sums: the samples do not tell one theta from all others.
+        # As small as rounding errors: the samples do not determine theta.
         if least <= 1e-12 * largest:
             return Status.ACQUIRING
         most = 0.1**2 * float((theta[1] * size[1]) ** 2 + (theta[2] * size[2]) ** 2)
         if self._mean_square(np.array(theta)) <= least * most:
             self._judged, self._most, self._weights = theta, most, tuple(size.tolist())
             return Status.TRACKING
-        # With R = Q diag(l) Q' this is R^-1, positive definite whatever rounding does to R.
+        # R^-1 from R = Q diag(l) Q', positive definite in spite of rounding.
         inverse = (vectors / eigenvalues) @ vectors.T
         best = inverse @ (self._products[:3, 3] / size) / size
         variance = self._mean_square(best) * float(inverse[0, 0])

@@ -1,16 +1,16 @@
-"""The laws that learn from u reconstructed from y: normalised LMS, and the law as printed.
+"""Laws that learn from u as reconstructed from y: normalized LMS, and the law as printed.
 
 LMS is the recursion that the paper describes in words (section 3.2). With theta =
-(m, m c_r, m c_l) and phi = (v, -1{right}, -1{left}), u = theta' phi while a side is engaged: the
-error is linear in the products, not in m, c_r, c_l themselves, so they are learned:
+(m, m c_r, m c_l) and phi = (v, -1{right}, -1{left}), u = theta' phi while a side is engaged. The
+products are learned, as the error is linear in them, but not in c_r and c_l:
 
     theta(k+1) = theta(k) + step e W phi / (phi' W phi),   e = u - theta' phi
 
-W = diag(1/v_max^2, 1, 1) gives the slope and the crossings regressors of one size.
+W = diag(1/v_max^2, 1, 1) scales the regressors of slope and crossings to the same size.
 f follows the gradient of J = E{(u - u_d)^2} (3.6): f(k+1) = f(k) + step_f (u - u_d) v / (1 + v^2).
 
-The four printed quotients (3.11) reduce to the one equation e = u - u_d = 0, solved for one unknown
-at a time; one equation cannot identify four unknowns, docs/paper.md says what follows:
+The four printed quotients (3.11) reduce to the single equation e = u - u_d = 0, solved for one
+unknown at a time. One equation cannot identify four unknowns (docs/paper.md):
 
     f   = m (u - y_m) / (u + m w)         m   = u f / (u - y_m - f w)
     c   = (u - y_m) / f - u / m           (c_r and c_l alike)
@@ -31,11 +31,11 @@ from backlash_ros.core.laws.input_reconstruction import (
 from backlash_ros.core.parameters import Bounds, Parameters
 from backlash_ros.core.plant.transfer_function import Array
 
-STROKE = 8  # samples to either side over which u moves on in one direction
+STROKE = 8  # samples before and after u(k) over which u must move in one direction
 
 
 class LaggedLaw(Law):
-    """Learns from u reconstructed some samples late, and what was applied when it acted."""
+    """Learns from u, reconstructed with a lag, and from what was applied when that u acted."""
 
     innovation, u_hat = nan, 0.0
 
@@ -54,7 +54,7 @@ class LaggedLaw(Law):
         return self._reconstruction.x_hat
 
     def update(self, y: float | None, interval: Interval) -> None:
-        """Take in y(k) and learn from the sample that the reconstruction has reached."""
+        """Process y(k) and learn from the sample that the reconstruction has reached."""
         self.u_hat = u = self._reconstruction.update(y)
         self.innovation = self._reconstruction.innovation
         self._past.append(u)
@@ -71,10 +71,10 @@ class LaggedLaw(Law):
         raise NotImplementedError
 
     def _rising(self, u: float) -> bool | None:
-        """Whether u moves on the right line (True) or the left one; None where it may rest.
+        """Whether u moves on the right line (True) or the left one (False); None if it may rest.
 
-        It counts as moving by two deviations of its error, as smoothing rounds the corners, and at
-        no less than a quarter of the mean pace of the stroke.
+        It moves if it changes by more than two standard deviations of its error to either side, as
+        smoothing rounds corners, and at a quarter of the mean speed of the stroke or faster.
         """
         ahead, behind = self._reconstruction.newer(STROKE) - u, u - self._past[0]
         step, rising = u - self._past[-2], True
@@ -86,9 +86,9 @@ class LaggedLaw(Law):
 
 
 class NormalisedLms(LaggedLaw):
-    """LMS on (m, m c_r, m c_l) and f, fed with u reconstructed from y.
+    """LMS for (m, m c_r, m c_l) and f, with u reconstructed from y.
 
-    step: 0 < step < 2. step_f: 0 keeps f. Where y moves against v nothing is learned.
+    step: gain, 0 < step < 2. step_f: that of f, 0 keeps f. Nothing is learned if y moves against v.
     """
 
     RETUNED = ('lms.step', 'lms.step_f')
@@ -113,7 +113,7 @@ class NormalisedLms(LaggedLaw):
         e = u - m * (v - (c_r if rising else c_l))
         weight = 1.0 / self._v_max**2 if self._v_max**2 > LEAST_SQUARE else 0.0
         gain = self.step * e / (weight * v * v + 1.0)
-        # Products first: they enter the error linearly, the crossings follow by division.
+        # The products are updated; the crossings follow by division.
         product_r = m * c_r - gain if rising else m * c_r
         product_l = m * c_l if rising else m * c_l - gain
         if self.step_f > 0.0:
@@ -124,37 +124,37 @@ class NormalisedLms(LaggedLaw):
 
 
 def printed_f(u: float, y_m: float, m: float, w: float) -> float:
-    """f = F_n / F_d of (3.11); nan where F_d is 0."""
+    """f = F_n / F_d of (3.11); nan if F_d is 0."""
     numerator = u * y_m * m**2 + u * w * m**3 - y_m**2 * m**2 - y_m * m**3 * w
     denominator = u * y_m * m + y_m * w * m**2 + w**2 * m**3 + u * w * m**2
     return numerator / denominator if denominator != 0.0 else nan
 
 
 def printed_m(u: float, y_m: float, f: float, w: float) -> float:
-    """m = M_n / M_d of (3.11); nan where M_d is 0."""
+    """m = M_n / M_d of (3.11); nan if M_d is 0."""
     numerator = u * y_m * f**2 + u * f**3 * w
     denominator = u * y_m * f + u * f**2 * w - y_m**2 * f - 2.0 * y_m * f**2 * w - f**3 * w**2
     return numerator / denominator if denominator != 0.0 else nan
 
 
 def printed_c(u: float, y_m: float, f: float, m: float) -> float:
-    """c_r = C_1n / C_1d and c_l = C_2n / C_2d of (3.11), which are alike; nan where C_1d is 0."""
+    """c_r = C_1n / C_1d or c_l = C_2n / C_2d of (3.11), the same formula; nan if C_1d is 0."""
     numerator = u * f * m**2 - u * f**2 * m - y_m * m**2 * f
     denominator = f**2 * m**2
     return numerator / denominator if denominator != 0.0 else nan
 
 
 class PrintedLaw(LaggedLaw):
-    """Equations (3.11), evaluated in the printed order with the newest values.
+    """Equations (3.11), evaluated in the printed order, each with the newest values.
 
-    Guards: a quotient that is not finite is skipped, the rest is projected into the bounds.
+    A quotient that is not finite is skipped; others are clipped to their bounds.
     """
 
     _upward, _u_before = True, 0.0
 
     def _learned(self, u: float, past: Interval, rising: bool | None) -> Estimate:
         old = self.estimate
-        # w is c_r in the upward region, c_l in the downward one, and kept in the gap.
+        # w is c_r in the upward region, c_l in the downward one, and keeps its value in the gap.
         if u != self._u_before:
             self._upward = u > self._u_before
         upward, self._u_before = self._upward, u
