@@ -21,7 +21,7 @@ class RecordFit(NamedTuple):
     data favour another). doubts, against, outside: why the result is unusable: imprecise values, y
     moves against v, bounds violated. estimates: (value, standard deviation) of m (negative if y
     moves against v), c_r, c_l. fit: of -y if m is negative. predicted: share of the motion of y
-    that is explained. reversals: of the play. margins: log-evidence that each delay falls behind."""
+    that is explained. reversals: of the play. margins: log-evidence that each delay is behind."""
 
     nominal: TransferFunction
     model: TransferFunction
