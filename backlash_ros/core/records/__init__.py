@@ -1,1 +1,1 @@
-"""Records as people have them: rows with stamps of any kind become v and y on one grid of time."""
+"""Turn the rows of any log, with stamps of any kind, into v and y on one uniform grid of time."""

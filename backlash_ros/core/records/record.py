@@ -1,4 +1,4 @@
-"""v and y on one uniform grid: all that an identification needs to know of where they came from."""
+"""Record: v and y on one uniform grid, and what an identification needs to know of their origin."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from backlash_ros.core.plant.transfer_function import Array
 
 
 class RecordError(ValueError):
-    """A record of which no sense can be made: one line says what, where and the cure."""
+    """A record cannot be understood: one line says what is wrong, where, and the cure."""
 
 
 def seconds(time_s: float) -> str:
-    """A time for people."""
+    """A time [s] as text, in ms or s."""
     return f'{time_s * 1e3:.4g} ms' if time_s < 0.1 else f'{time_s:.4g} s'
 
 
 def counted(number: int, of: str) -> str:
-    """How many there are, for people."""
+    """A number with its noun as text, in the plural unless it is 1."""
     return f'{number} {of}{"" if number == 1 else "s"}'
 
 
@@ -27,10 +27,10 @@ def counted(number: int, of: str) -> str:
 class Record:
     """One motion on a uniform grid of sample_period [s], N samples.
 
-    v (N,): acts from sample k to k+1, finite. y (N,): at k; nan where there is no reading of its
-    own. quantum: step of the readings of y before they were moved onto the grid, 0 for none.
-    commands (N,): what led to v, where v is that of a motor encoder. timing: one sentence on what
-    was done to the stamps. notes: what else was done, a sentence each. source: where it is from.
+    v (N,): acts from sample k to k+1, finite. y (N,): read at k, nan where k has no reading of its
+    own. quantum: quantization step of y before it was moved onto the grid, 0 if none. commands
+    (N,): what the motor was told, if v is from its encoder. timing: one sentence on what was done
+    to the stamps. notes: what else was done, a sentence each. source: where the record is from.
     """
 
     v: Array
@@ -47,7 +47,7 @@ class Record:
         return int(np.isnan(self.y).sum())
 
     def between(self, from_s: float, to_s: float) -> Record:
-        """The samples from from_s on and before to_s [s]; raises RecordError where none is."""
+        """The samples from from_s up to, not including, to_s [s]; RecordError if there are none."""
         t = self.sample_period * np.arange(len(self.v))
         slack = 1e-6 * self.sample_period  # of rounding
         kept = (t >= from_s - slack) & (t < to_s - slack)

@@ -1,4 +1,4 @@
-"""Stamps of a log in seconds, and its rows in the order of time, without stamps that are none."""
+"""Bring the stamps of a log to seconds and its rows in order of time, without invalid stamps."""
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -11,9 +11,9 @@ from backlash_ros.core.records.record import RecordError, counted, seconds
 def in_seconds(
     t: Array | None, count: int, period: float | None, unit_s: float | None, said: list[str],
 ) -> Array:
-    """Stamps [s] of `count` rows, by their number where there are none, or none that move.
+    """Stamps [s] of `count` rows; if t is None or does not move, rows are counted by their period.
 
-    unit_s: if the log says it. said: takes up what was done. Raises RecordError.
+    unit_s: unit of t [s], if the log gives it. said: what was done is added. Raises RecordError.
     """
     known = np.empty(0) if t is None else t[np.isfinite(t)]
     if t is None or np.unique(known).size < 2:
@@ -24,7 +24,7 @@ def in_seconds(
         return period * np.arange(count, dtype=np.float64)
     unit_s = unit_s or _guessed_unit(known, period, said)
     t = np.where(np.isfinite(t), t, np.nan)
-    # A clock of 16 or 32 bits, of a day, half a day, an hour.
+    # Clocks that begin anew: 16 or 32 bits, a day, half a day, an hour.
     for around in (2.0**16, 2.0**32, *(hours * 3600.0 / unit_s for hours in (24.0, 12.0, 1.0))):
         falls = np.diff(t, prepend=t[0]) < -0.5 * around
         counted = t + around * np.cumsum(falls)
@@ -34,7 +34,7 @@ def in_seconds(
             said.append(f't begins anew after {seconds(around * unit_s)}: counted on')
             t = counted
             break
-    # Exact differences of numbers that hardly fit.
+    # The median goes first: large stamps would lose digits when they are scaled.
     return np.asarray((t - np.median(known)) * unit_s)
 
 
@@ -47,7 +47,7 @@ def _guessed_unit(known: Array, period: float | None, said: list[str]) -> float:
     step = typical_step(known if known[-1] > known[0] else known[::-1])
     whole = step >= 1.0 and bool((known == np.round(known)).all())
     if period is None:
-        if whole and size < 1e9:  # else since 1970
+        if whole and size < 1e9:  # else seconds since 1970
             said.append('t, in whole numbers, is taken as seconds; if it counts something else: '
                         '--period')
         return 1.0
@@ -62,7 +62,7 @@ def _guessed_unit(known: Array, period: float | None, said: list[str]) -> float:
 
 
 def typical_step(t: Array) -> float:
-    """Median of the steps of t (N,) that go forward; raises RecordError where there is none."""
+    """Median of the forward steps of t (N,); raises RecordError if there are none."""
     steps = np.diff(t)
     if not (steps > 0.0).any():
         raise RecordError('t does not rise: give --period S, the time from row to row')
@@ -70,8 +70,8 @@ def typical_step(t: Array) -> float:
 
 
 def in_order(t: Array, said: list[str], what: str = 'row') -> NDArray[np.intp]:
-    """Rows of the stamps t (N,) [s] that are kept, by time; raises RecordError where they make no
-    sense. what: name of a row."""
+    """Indices of the rows to keep, in order of their stamps t (N,) [s]; raises RecordError if the
+    stamps make no sense. what: noun for a row. said: what was done is added."""
     rows = np.flatnonzero(np.isfinite(t))
     if len(rows) < len(t):
         said.append(f'{counted(len(t) - len(rows), what)} without a time left out')
@@ -79,12 +79,12 @@ def in_order(t: Array, said: list[str], what: str = 'row') -> NDArray[np.intp]:
     if np.count_nonzero(steps < 0.0) > np.count_nonzero(steps > 0.0):
         rows = rows[::-1]
         said.append(f'the newest {what} stood first: turned around')
-    # Far from the rows around, of which up to five in a row may be bad.
+    # Far from the median of the rows around, which bears five bad ones in a row.
     size = min(11, len(rows) - 1 + len(rows) % 2)
     around = np.median(
         sliding_window_view(np.pad(t[rows], size // 2, 'reflect'), size), axis=1)
     bad = np.abs(t[rows] - around) > 50.0 * typical_step(t[rows])
-    # A clock that began anew falls back by several periods; less is disorder.
+    # A clock that began anew falls back by several periods; smaller steps back are disorder.
     sound = rows[~bad]
     parts = np.split(sound, np.flatnonzero(np.diff(t[sound]) < -3.0 * typical_step(t[sound])) + 1)
     longest = max(parts, key=len)
@@ -105,8 +105,8 @@ def in_order(t: Array, said: list[str], what: str = 'row') -> NDArray[np.intp]:
 
 
 def spread_evenly(t: Array, said: list[str], *signals: Array) -> Array:
-    """Stamps (N,) of a coarse clock, where several rows in a row have the same one and the signals
-    (N,) move within such a run as from run to run; else the same readings were written again."""
+    """Spread the stamps (N,) of a coarse clock evenly, if runs of rows share a stamp and the
+    signals (N,) move within a run about as much as between runs: else rows repeat one reading."""
     begins = np.flatnonzero(np.diff(t, prepend=-np.inf) > 0.0)
     lengths, starts = np.diff(begins, append=len(t)), t[begins]
     if len(lengths) < 4 or np.median(lengths[:-1]) < 2.0:
@@ -119,7 +119,7 @@ def spread_evenly(t: Array, said: list[str], *signals: Array) -> Array:
             return t
     said.append(f'up to {lengths[:-1].max()} rows share a stamp, and move: spread evenly')
     place = np.arange(len(t))
-    # The first run may have begun before the log did.
+    # The log may begin in the middle of a run, so the first one does not count.
     steps, counts = np.diff(starts)[1:], lengths[1:-1]
     whole = steps < 1.5 * np.median(steps)
     missing = np.round(steps * counts[whole].sum() / steps[whole].sum()) - counts
@@ -138,6 +138,6 @@ def spread_evenly(t: Array, said: list[str], *signals: Array) -> Array:
 
 
 def fewest_digits(value: float, deviation: float) -> float:
-    """The number with the fewest digits within a deviation: no more than the stamps bear."""
+    """The number with the fewest digits that is within `deviation` of the value."""
     texts = (float(f'{value:.{digits}g}') for digits in range(1, 9))
     return next((text for text in texts if abs(text - value) <= deviation), value)

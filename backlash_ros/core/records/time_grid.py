@@ -1,8 +1,8 @@
-"""From rows of a log with stamps of any kind to v and y on one uniform grid.
+"""Convert rows of a log, with stamps of any kind, to v and y on one uniform grid.
 
-The motion, smooth over the true instants, tells stamps that are late, where rows are numbered, from
-true ones. Over these v, which holds, is averaged over each period, and y is moved onto the grid
-where its noise hides the error of that; else the grid is finer, with nothing between the readings.
+Motion is smooth over the true instants: this tells true stamps from late ones, whose rows are
+numbered instead. With true stamps v, which holds, is averaged over each period, and y is moved onto
+the grid if its noise hides the error; else the grid is finer, and y unknown between readings.
 """
 
 from dataclasses import replace
@@ -20,13 +20,13 @@ from backlash_ros.core.records.record import Record, RecordError, counted, secon
 
 Numbers = NDArray[np.int64]
 
-BREAK = 3.0  # periods from row to row that are a gap
+BREAK = 3.0  # periods without a row that are a break
 MOST_SAMPLES = 1_000_000  # of a grid
 
 
 class Rows(NamedTuple):
-    """In order: t (M,) [s], y (M,), nan where it is no reading of its own; v and commands, (M,), or
-    times and values of their own (2, K); whether those of v report what acted until then."""
+    """Rows in order of time: t (M,) [s], y (M,), nan without a reading of its own; v and commands,
+    (M,) or times and values of their own (2, K). reported: v is what acted until its time."""
 
     t: Array
     v: Array
@@ -36,7 +36,7 @@ class Rows(NamedTuple):
 
 
 class Numbering(NamedTuple):
-    """Of rows (M,), whose stamps lie `off` begin + period * numbers [s]."""
+    """Numbers of rows (M,), whose stamps are begin + period * numbers + off [s]."""
 
     numbers: Numbers
     period: float
@@ -48,9 +48,9 @@ def record_of(
     t: Array | None, v: Array, y: Array, period: float | None = None,
     unit_s: float | None = None, commands: Array | None = None,
 ) -> Record:
-    """A record from rows (N,) of a log, nan for what is not known; raises RecordError.
+    """Make a record of the rows (N,) of a log, nan where not known; raises RecordError.
 
-    t: stamps, of unit_s [s] if the log says it. period [s]: from sample to sample, if known.
+    t: stamps. unit_s: unit of t [s], if the log gives it. period [s]: of the samples, if known.
     """
     said, notes = list[str](), list[str]()
     if len(v) < 2:
@@ -88,8 +88,8 @@ def record_of(
 def without_turns(
     t: Array, v: Array, y: Array, said: list[str], notes: list[str],
 ) -> tuple[Array, Array]:
-    """v (N,) and y (N,) at t (N,) without whole turns; y nan where it is no reading of its own."""
-    # An angle that begins anew is far from the rows around as well.
+    """v (N,) and y (N,) at t (N,) with turns counted; y nan where it is no reading of its own."""
+    # Turns are counted first: after one, an angle is far from the rows around as well.
     bad, value = readings.failed(readings.unwrapped(y)[0])
     if bad.any():
         notes.append(f'y reads exactly {value:.6g} in {bad.sum()} of {len(bad)} rows, far from the '
@@ -113,9 +113,8 @@ def _with_turns_counted(name: str, values: Array, notes: list[str]) -> Array:
 
 
 def usable(record: Record, read: Array, said: list[str], notes: list[str]) -> Record:
-    """From the first known v on, held where it is not known. read: y, before it was moved.
-
-    Raises RecordError where v or y are no measurements.
+    """The record from the first known v on, with v held where it is not known. read: y before it
+    was moved onto the grid. Raises RecordError if v or y cannot be measurements.
     """
     _check(v=record.v, y=record.y)
     first = int(np.argmax(np.isfinite(record.v)))
@@ -135,7 +134,7 @@ def usable(record: Record, read: Array, said: list[str], notes: list[str]) -> Re
 
 
 def _check(**signals: Array) -> None:
-    """Raise RecordError where the values are no measurements."""
+    """Raise RecordError for values that cannot be measurements."""
     for name, values in signals.items():
         if not np.isfinite(values).any():
             raise RecordError(f'{name} holds no number')
@@ -147,17 +146,17 @@ def _check(**signals: Array) -> None:
 
 
 def _held(values: Array) -> Array:
-    """With the one before it for each that is not known."""
+    """The values (N,) with each unknown one replaced by the last known one before it."""
     newest = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), 0))
     return np.asarray(values[newest])
 
 
 def on_grid(rows: Rows, period: float | None = None, late: bool = False) -> Record:
-    """Rows on a grid of this period [s], if it is known; raises RecordError.
+    """Put rows on a grid of this period [s], which is estimated if None; raises RecordError.
 
-    late: stamps are those of messages, which are late, never early.
+    late: stamps are those of messages, which may be late but never early.
     """
-    nearly_even = 0.02  # of a period that stamps of even samples may be off
+    nearly_even = 0.02  # share of a period by which stamps of even samples may be off
     guess = period or (stamps.typical_step(rows.t) if late else _period(rows.t))
     rows, cut = _longest_stretch(rows, guess)
     if len(rows.t) < 2 or not np.isfinite(rows.y).any():
@@ -176,7 +175,7 @@ def on_grid(rows: Rows, period: float | None = None, late: bool = False) -> Reco
     come = f'{cut}stamps jitter by {percent} around {seconds(mean * guess)}'
     if period is not None:
         found = _along(_late_numbers(rows.t / period), rows.t)
-    # Too many may be missing, or too late, to be numbered.
+    # With too many rows missing, or too late, numbers would be wrong.
     if found.numbers[-1] + 1 <= 1.3 * len(rows.t) and np.std(found.off) <= found.period and sum(
             readings.rougher(rows.t, found.numbers.astype(float), signal)
             for signal in (rows.y, rows.v) if signal.ndim == 1) > 0.05:
@@ -189,17 +188,17 @@ def on_grid(rows: Rows, period: float | None = None, late: bool = False) -> Reco
 
 
 def _period(t: Array) -> float:
-    """Time from row to row, roughly."""
+    """Approximate time from row to row."""
     steps = np.diff(t)
     steps = steps[steps <= BREAK * stamps.typical_step(t)]
     low, middle, high = np.percentile(steps, [15.0, 50.0, 85.0]).tolist()
-    # With many equal stamps, or uneven steps, the mean tells it.
+    # With many equal stamps or uneven steps, only the mean is right.
     return float(f'{middle if high - low < 0.5 * middle else float(np.mean(steps)):.6g}')
 
 
 def _longest_stretch(rows: Rows, period: float) -> tuple[Rows, str]:
-    """Without what lies far before and after; what was done."""
-    long_break = 100.0  # periods of a gap that ends a stretch
+    """The longest stretch of rows without a long break, and a text on what was cut off."""
+    long_break = 100.0  # periods without a row that end a stretch
     t, span = rows.t, np.ptp(rows.t) / period
     if span < min(20.0 * len(t) + long_break, MOST_SAMPLES):
         return rows, ''
@@ -223,16 +222,16 @@ def _along(numbers: Numbers, t: Array) -> Numbering:
 
 
 def _numbering(t: Array, steps: Array, period: float, late: bool) -> Numbering:
-    """The one that lies closest to a line. steps (M - 1,): in periods."""
+    """Of several ways to number the rows, the one closest to a line. steps (M - 1,): in periods."""
     found = [_along(_late_numbers(t / period), t)]
     if not late:
-        # The median of uneven steps is off by more than a long record bears.
+        # Over a long record, the error of a median of uneven steps would add up: the mean as well.
         usual = steps[steps < 0.5 * BREAK]
         mean = period * (float(np.mean(usual)) if usual.any() else 1.0)
         found += [_along(numbers, t) for numbers in (
             _risen(np.append(0.0, np.cumsum(np.round(steps)))), _late_numbers(t / mean),
             _risen(np.round((t - t[0]) / period)))]
-        # Around the line that all of them tell, as far as they are late by less than a period.
+        # Then each stamp rounded to the line of each numbering found so far.
         found += [_along(_risen(np.round((t - one.begin) / one.period)), t)
                   for one in found if one.period > 0.0]
     found = [one for one in found if one.period > 0.0 and one.numbers[-1] < MOST_SAMPLES]
@@ -244,19 +243,19 @@ def _numbering(t: Array, steps: Array, period: float, late: bool) -> Numbering:
 
 
 def _late_numbers(times: Array) -> Numbers:
-    """From times [periods], late, never early; of those that come in a heap the last is newest."""
+    """Number times [periods] that may be late, never early; in a heap the last is the newest."""
     return _risen(np.array(numbered(times.tolist(), 1.0, 1.0 - JITTER)))
 
 
 def _risen(numbers: Array) -> Numbers:
-    """The numbers strictly rising from 0, the last of a heap keeping its place."""
+    """The numbers made to rise strictly, by lowering those before the last of a heap, from 0."""
     place = np.arange(len(numbers))
     risen = np.minimum.accumulate((numbers - place)[::-1])[::-1] + place
     return np.asarray(risen - risen[0], dtype=np.int64)
 
 
 def _numbered_grid(rows: Rows, index: Numbers, period: float, said: str) -> Record:
-    """Each row at its number; v holds over those that are missing."""
+    """Put each row at its number; v holds over missing rows."""
     count = int(index[-1]) + 1
     y = np.full(count, np.nan)
     y[index] = rows.y
@@ -265,7 +264,7 @@ def _numbered_grid(rows: Rows, index: Numbers, period: float, said: str) -> Reco
     def over(values: Array, reported: bool = False) -> Array:
         if values.ndim == 1:
             return values[np.searchsorted(index, np.arange(count), side='right') - 1]
-        # What is sent more often than samples are taken is averaged.
+        # Commands that come more often than samples are averaged.
         if not reported and values.shape[1] > 1.5 * count:
             return averaged(values[0] - rows.t[0], values[1], period, count)
         outputs_ns, sent_ns = ((1e9 * (each - rows.t[0])).astype(np.int64)
@@ -277,8 +276,8 @@ def _numbered_grid(rows: Rows, index: Numbers, period: float, said: str) -> Reco
 
 
 def _true_instants(rows: Rows, begin: float, period: float, said: str) -> Record:
-    """v averaged over each period from begin [s] on, y where it was read."""
-    hidden, least = 0.5, 1e-3  # error of moving y that is hidden: of its noise, of its swing
+    """Average v over each period from begin [s] on, and put y where it was read."""
+    hidden, least = 0.5, 1e-3  # error of moving y that does not matter, over its noise, its swing
     known = np.isfinite(rows.y)
     t, y = rows.t[known] - begin, rows.y[known]
     equal = int(np.count_nonzero(np.diff(rows.t) == 0.0))
@@ -294,17 +293,17 @@ def _true_instants(rows: Rows, begin: float, period: float, said: str) -> Record
         index, values = np.round(t / step).astype(np.int64), y
         off = index * step - t
         shared = np.mean(np.diff(index) == 0) > 0.02 if len(index) > 1 else False
-        # A standard deviation, but for steps: nine tenths of normal values stay within 1.64.
+        # A standard deviation that ignores jumps: 90 % of normal values are within 1.64 of it.
         moved = np.percentile(np.abs(np.gradient(y, t) * off), 90.0) / 1.64 if len(t) > 1 else 0.0
         if not shared and moved <= hidden * noise:
             break
-        # Along the line to the next reading on that side.
+        # Interpolate linearly to the next reading on that side.
         values = np.interp(index * step, t, y)
         share = np.clip(np.abs(off) / np.maximum(np.gradient(t), step), 0.0, 0.5)
         error = bend * float(np.sqrt(np.mean((4.0 * share * (1.0 - share))**2)))
         if error <= max(hidden * noise, least * swing):
             if shared and parts == 1:
-                # Every instant of the grid between two readings that are near enough.
+                # At every instant of the grid between two readings that are close enough.
                 index = np.arange(int(t[0] / step + 1.0 - 1e-9), int(t[-1] / step + 1e-9) + 1)
                 after = np.clip(np.searchsorted(t, index * step), 1, len(t) - 1)
                 index = index[t[after] - t[after - 1] <= 2.0 * step]
@@ -324,10 +323,10 @@ def _true_instants(rows: Rows, begin: float, period: float, said: str) -> Record
 
 
 def averaged(t: Array, v: Array, step: float, count: int) -> Array:
-    """v (M,), held from each t (M,) to the next, over each of `count` steps."""
+    """Mean of v (M,), which holds from each t (M,) to the next, over each of `count` steps."""
     edges = step * np.arange(count + 1)
     begin = np.clip(np.searchsorted(t, edges[:-1], side='right') - 1, 0, len(t) - 1)
-    # Each change counts for what is left of its step: where v rests it stays the same number.
+    # Each change counts for the rest of its step, so that a v at rest keeps its exact value.
     changed = np.flatnonzero((t[1:] > edges[0]) & (t[1:] < edges[-1])) + 1
     of_step = np.searchsorted(edges, t[changed], side='left') - 1
     share = (v[changed] - v[changed - 1]) * (edges[of_step + 1] - t[changed]) / step
