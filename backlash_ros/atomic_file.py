@@ -1,17 +1,17 @@
-"""Files that appear complete or not at all."""
+"""Write files that appear complete or not at all."""
 
 import os
 from pathlib import Path
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
-    """Write content to a temporary file beside path and rename it."""
+    """Write content to a temporary file beside path and rename that to path."""
     temporary = _beside(path)
     try:
         with temporary.open('wb') as file:
             file.write(content.encode() if isinstance(content, str) else content)
             file.flush()
-            # Otherwise a power cut may leave the new name with nothing behind it.
+            # Otherwise a power cut may leave an empty file under the new name.
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except BaseException:
@@ -20,7 +20,7 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 
 def point_link(link: Path, target: str) -> None:
-    """Let the symbolic link point at target, replacing an older link in one step."""
+    """Make the symbolic link point to target, replacing an older link in one step."""
     temporary = _beside(link)
     temporary.unlink(missing_ok=True)
     temporary.symlink_to(target)

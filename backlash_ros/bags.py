@@ -1,7 +1,7 @@
-"""rosbag2 bags: written so that a crash costs a moment at most; read, whole or torn; repaired.
+"""Write rosbag2 bags so that a crash costs a moment at most, read them even if torn, repair them.
 
-Torn ones are read by the stream reader of mcap and the recovery of SQLite: neither needs the index
-or the metadata.yaml that only a bag that was closed has.
+Torn bags are read by the stream reader of mcap and the recovery of SQLite, which need neither the
+index nor the metadata.yaml that only a closed bag has.
 """
 
 import fcntl
@@ -31,11 +31,11 @@ REPAIR_COMMAND = 'ros2 run backlash_ros recorder --repair'
 
 
 class RecordingError(RuntimeError):
-    """The bag cannot take any more: the message is the reason in a few words."""
+    """Nothing more can be written to the bag: the message is the reason in a few words."""
 
 
 class BagError(ValueError):
-    """A bag cannot be read or repaired: one line says which, why and, if known, the cure."""
+    """A bag cannot be read or repaired: one line says which, why, and the cure if it is known."""
 
 
 class NoBagError(BagError):
@@ -43,20 +43,20 @@ class NoBagError(BagError):
 
 
 class Topic(NamedTuple):
-    """A recorded topic; definition: text of the .msg file with all it refers to, if recorded."""
+    """A recorded topic. definition: the .msg file and all it refers to, as text, if recorded."""
 
     name: str
     message_type: str
     definition: str
 
 
-BagMessage = tuple[Topic, int, bytes]  # with its stamp [ns], in CDR
+BagMessage = tuple[Topic, int, bytes]  # stamp [ns], content in CDR
 
 class Bag:
-    """An open bag. After a RecordingError it is closed, and holds what was flushed before.
+    """A bag open for writing. A RecordingError closes it; what was flushed before is kept.
 
-    saved: messages that a crash leaves. saved_ns: the time from the first to the last of them.
-    survives_a_crash: whether flush() works with the version of rosbags that is installed.
+    saved: number of messages that survive a crash. saved_ns: time from the first to the last one.
+    survives_a_crash: whether flush() works with the installed version of rosbags.
     """
 
     def __init__(self, path: str, storage: str) -> None:
@@ -79,7 +79,7 @@ class Bag:
                     self.survives_a_crash = False
                 _sync(self.path, self.path.parent)
         except RecordingError as error:
-            # Half a bag would be in the way of the next attempt.
+            # A half-made bag would be in the way of the next attempt.
             shutil.rmtree(self.path, ignore_errors=True)
             raise ParameterError('bag', path, f'cannot be made: {error}',
                                  'name a folder where there is room and you may write') from None
@@ -93,7 +93,7 @@ class Bag:
             self._writer.write(connection, stamp_ns, message)
 
     def flush(self) -> None:
-        """Let all that was written survive a crash and a power cut."""
+        """Make all that was written survive a crash and a power cut."""
         if self.survives_a_crash:
             with self._closed_on_error():
                 self._flush()
@@ -107,7 +107,7 @@ class Bag:
         self._lock.close()
 
     def _flush(self) -> None:
-        """The only place that looks inside of rosbags, which has no such function of its own."""
+        """The only use of internals of rosbags, which has no flush of its own."""
         storage: Any = self._writer.storage
         if self._writer.storage_plugin is StoragePlugin.SQLITE3:
             storage.conn.commit()
@@ -128,7 +128,7 @@ class Bag:
         try:
             yield
         except (OSError, sqlite3.Error) as error:
-            # What does not fit on the disk now did not a moment ago.
+            # If the disk is full, closing the bag fails as well.
             with suppress(OSError, sqlite3.Error):
                 self._writer.abort()
             self._lock.close()
@@ -154,13 +154,13 @@ def _locked_folder(path: Path) -> Iterator[None]:
 
 
 def _sync(*paths: Path) -> None:
-    """Let files and the entries of folders survive a power cut."""
+    """Make files and the entries of folders survive a power cut."""
     for path in paths:
         descriptor = os.open(path, os.O_RDONLY)
         try:
             os.fsync(descriptor)
         except OSError:
-            # Some file systems cannot do it for folders.
+            # Some file systems cannot sync folders.
             if not path.is_dir():
                 raise
         finally:
@@ -173,7 +173,7 @@ def is_bag(path: Path) -> bool:
 
 
 def message_files(path: Path) -> list[Path]:
-    """The files with the messages of a bag in their order; itself, if it is one."""
+    """The files with the messages of a bag, in order; path itself, if it is such a file."""
     files = [path] if path.is_file() else path.glob('*')
     # bag_10 comes after bag_9.
     return sorted((file for file in files if file.suffix in STORAGE_OF_SUFFIX),
@@ -183,7 +183,7 @@ def message_files(path: Path) -> list[Path]:
 class BagReader:
     """The messages of a bag: its folder, or a lone .mcap or .db3 file. Raises NoBagError.
 
-    topics, damage ('' for none): of the bag, complete once messages() has ended.
+    topics: those found so far; damage: in words, '' if none. Complete once messages() has ended.
     """
 
     def __init__(self, path: Path) -> None:
@@ -199,7 +199,7 @@ class BagReader:
     def messages(
         self, wanted: Callable[[Topic], bool] = lambda topic: True,
     ) -> Iterator[BagMessage]:
-        """Every sound message of the wanted topics, in the order in which they were written."""
+        """Every intact message of the wanted topics, in the order in which they were written."""
         self.damage = ''
 
         def met(topic: Topic) -> bool:
@@ -210,18 +210,18 @@ class BagReader:
             read = _read_mcap if STORAGE_OF_SUFFIX[file.suffix] == 'mcap' else _read_sqlite
             try:
                 yield from read(file, met)
-            # Whatever damaged bytes make a library stumble over, the file is damaged.
+            # Damaged bytes may make a library raise anything.
             except Exception:
                 closed = (self.path / BAG_METADATA).is_file() or self.path.is_file()
                 self.damage = 'is damaged' if closed else 'was never closed'
 
 
 def _read_mcap(file: Path, wanted: Callable[[Topic], bool]) -> Iterator[BagMessage]:
-    """Messages up to the first record that is not sound."""
-    topics: dict[int, Topic] = {}  # the wanted ones by the number of their channel
+    """Messages up to the first damaged record."""
+    topics: dict[int, Topic] = {}  # the wanted ones by channel number
     schemas: dict[int, mcap.records.Schema] = {}
     with file.open('rb') as stream:
-        # A length that is garbage may be more than any memory holds.
+        # A damaged length may be larger than the memory.
         size = os.fstat(stream.fileno()).st_size
         for record in StreamReader(stream, validate_crcs=True, record_size_limit=size).records:
             if isinstance(record, mcap.records.Schema):
@@ -236,11 +236,11 @@ def _read_mcap(file: Path, wanted: Callable[[Topic], bool]) -> Iterator[BagMessa
 
 
 def _read_sqlite(file: Path, wanted: Callable[[Topic], bool]) -> Iterator[BagMessage]:
-    """Messages of all transactions that were committed, up to the first page that is not sound."""
-    # Opened for writing as well, SQLite takes back what a crash has left half done.
+    """Messages of all committed transactions, up to the first damaged page."""
+    # If opened for writing, SQLite rolls back what a crash has left half done.
     uri = f'{file.resolve().as_uri()}?mode=rw'
     with closing(sqlite3.connect(uri, uri=True)) as database:
-        # Otherwise a file that has lost its end is refused as a whole.
+        # Otherwise SQLite refuses a file that has lost its end.
         database.execute('PRAGMA writable_schema = ON')
         topics = {number: Topic(*rest) for number, *rest in database.execute(
             'SELECT topics.id, name, type, encoded_message_definition FROM topics '
@@ -269,7 +269,7 @@ def repair_command(path: Path) -> int:
 
 
 def damage(bag: Path) -> str:
-    """What keeps a bag from being complete, in words; empty for one that is."""
+    """Why a bag is not complete, in words; '' if it is."""
     reader = BagReader(bag)
     for _ in reader.messages():
         pass
@@ -277,9 +277,9 @@ def damage(bag: Path) -> str:
 
 
 def repair(bag: Path) -> list[str]:
-    """Put a complete bag in the place of a damaged one, which is kept beside it.
+    """Replace a damaged bag by a complete one; the original is kept beside it.
 
-    Returns what was saved, in lines, nothing for a complete bag; raises BagError.
+    Returns lines that say what was saved, none if the bag is complete; raises BagError.
     """
     bag = bag.resolve()
     if bag.is_file():
@@ -302,7 +302,7 @@ def _rewrite(reader: BagReader, why: str) -> list[str]:
     connections: dict[Topic, Connection] = {}
     storage = StoragePlugin[STORAGE_OF_SUFFIX[reader.files[0].suffix].upper()]
     with TemporaryDirectory(dir=bag.parent, prefix=f'{bag.name}.') as folder:
-        # The name of a bag is that of its file as well.
+        # The file of a bag has the name of the bag.
         repaired = Path(folder) / bag.name
         with Writer(repaired, version=9, storage_plugin=storage) as writer:
             for topic, stamp_ns, data in reader.messages():

@@ -1,4 +1,4 @@
-"""What every command line has in common: exit codes, errors in one line, numbers, shipped files."""
+"""What all command lines share: exit codes, errors in one line, types of options, shipped files."""
 
 import argparse
 import os
@@ -12,14 +12,14 @@ DEFAULT_CONFIG = 'paper_example.yaml'
 
 
 class OptionParser(argparse.ArgumentParser):
-    """Ends the process with one line where an option is wrong."""
+    """A parser that ends the process with a single line if an option is wrong."""
 
     def error(self, message: str) -> NoReturn:
         self.exit(BAD_INPUT, f'{self.prog}: {message} (--help lists the options)\n')
 
 
 def positive(text: str) -> float:
-    """An option that is a number; argparse reports what is not finite and > 0."""
+    """Type of an option that is a number; argparse reports one that is not finite and > 0."""
     number = float(text)
     if not 0.0 < number < inf:
         raise argparse.ArgumentTypeError(f'{text} must be finite and > 0')
@@ -27,7 +27,7 @@ def positive(text: str) -> float:
 
 
 def port(text: str) -> int:
-    """An option that is a port of TCP; argparse reports what is none."""
+    """Type of an option that is a TCP port; argparse reports a number that is not one."""
     number = int(text)
     if not 0 <= number <= 65535:
         raise argparse.ArgumentTypeError(f'{text} must be from 0 (a free one) to 65535')
@@ -37,12 +37,12 @@ def port(text: str) -> int:
 def add_motion_options(
     parser: argparse.ArgumentParser | argparse._ArgumentGroup, duration_s: float, what: str,
 ) -> None:
-    """Add what --drive and its like take. what: --duration is, with its default duration_s."""
+    """Add the options of a motion. what: the meaning of --duration, whose default is duration_s."""
     for name, default, unit, text in (
         ('duration', duration_s, 'SECONDS', f'{what} (default: {duration_s:g})'),
         ('wait', 10.0, 'SECONDS', 'how long to wait for a driver (default: 10)'),
-        ('rest', 30.0, 'SECONDS', 'drive: longest way to rest at the end, after which v is held '
-         '(default: 30); a signal on that way holds v at once'),
+        ('rest', 30.0, 'SECONDS', 'drive: longest time to come to rest at the end, after which v '
+         'is held (default: 30); a signal in that time holds v at once'),
         ('amplitude', None, 'V', 'drive: keep v within ±V as well'),
         ('rate', None, 'V_PER_S', 'drive: keep v slower than this as well'),
     ):
@@ -52,12 +52,12 @@ def add_motion_options(
 
 
 def find_config(config: Path | None) -> Path:
-    """Path of a configuration file: as given, or among the shipped ones; None: the paper's."""
+    """Path of a configuration file, as given or among the shipped ones; the paper's if None."""
     if config is not None and (config.exists() or config.parent != Path()):
         return config
     given = config or Path(DEFAULT_CONFIG)
     prefixes = [*os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep), sys.prefix]
-    # The source tree first: beside the code that runs lies the configuration written for it.
+    # The source tree first: its configuration was written for the code that runs.
     folders = [Path(__file__).resolve().parents[1],
                *(Path(prefix) / 'share' / 'backlash_ros' for prefix in filter(None, prefixes))]
     files = (folder / 'config' / given.name for folder in folders)

@@ -1,6 +1,6 @@
-"""All that may be wrong with a driver, and the cure: its graph, its messages, its motion.
+"""Judge a driver by its ROS graph, its messages and its motion: what is wrong, and the cure.
 
-Each fault shows once. What a fault hides is not judged: amid lost samples nobody knows G(z).
+Each fault is reported once. What it hides is not judged: with the wrong rate nobody knows G(z).
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -26,12 +26,12 @@ FITS, WRONG, UNKNOWN = '✓', '✗', '–'
 MOTION = ('reaction delay', 'sign and units', 'G(z)', 'noise on y', 'backlash')
 MESSAGES = ('rate', 'jitter', 'lost samples', 'repeated samples', 'clock', 'values')
 ORDER = ('publisher', 'type', 'QoS', 'listener', *MESSAGES, 'applied_control', *MOTION)
-FEWEST_SAMPLES = 20  # for a judgement of the timing
-MORE_DELAY = 8  # samples that are tried beyond the expected delay
+FEWEST_SAMPLES = 20  # needed to judge the timing
+MORE_DELAY = 8  # samples beyond the expected delay that are tried
 
 
 class Message(NamedTuple):
-    """A number on a topic, when it left and arrived [ns], and its number in the sequence."""
+    """A value on a topic, when it was sent and received [ns], and its sequence number."""
 
     value: float
     stamp_ns: int
@@ -41,19 +41,19 @@ class Message(NamedTuple):
 
 @dataclass
 class Graph:
-    """What the ROS graph says of plant_output, and of control without the tools of this package."""
+    """Who is on plant_output and control in the ROS graph, apart from tools of this package."""
 
     publishers: int = 0
     types: tuple[str, ...] = ()
     listeners: int = 0
-    misfits: tuple[str, ...] = ()  # reasons why control cannot pass, from QoS
-    best_effort: bool = False  # plant_output
-    near_control: tuple[str, ...] = ()  # subscribed topics of a name like control
+    misfits: tuple[str, ...] = ()  # why the QoS keeps control from its subscribers
+    best_effort: bool = False  # whether plant_output is
+    near_control: tuple[str, ...] = ()  # subscribed topics whose name is like control
 
 
 @dataclass
 class Heard:
-    """Messages of the three topics, which grow, and when listening ended [ns]."""
+    """The messages heard so far on the three topics, and when listening ended [ns]."""
 
     outputs: list[Message] = field(default_factory=list)
     controls: list[Message] = field(default_factory=list)
@@ -67,11 +67,11 @@ class Heard:
 
 
 class Sampling(NamedTuple):
-    """Samples without repetitions, a row each, their count from 0 and their period.
+    """Samples without repetitions, a row each, their numbers from 0 and their period.
 
-    repeated: with the value of the one before. early: with another value, but long before they were
-    due. lateness: of a period, of 98 % of the samples. bursts: they cannot be counted for certain.
-    commanded, reported: v over each interval (N,), nan before any; None where nothing tells it.
+    repeated: number of messages that came twice. early: number that came long before they were due.
+    lateness: spread of the stamps of 98 % of the samples, in periods. bursts: too large to count
+    them with certainty. commanded, reported: v over each interval (N,), nan before any, or None.
     """
 
     outputs: NDArray[np.void]
@@ -87,7 +87,7 @@ class Sampling(NamedTuple):
 
     @property
     def record(self) -> tuple[Array, Array] | None:
-        """v from sample k to k+1 and y at k, nan where lost, from the first known v on, if any."""
+        """v from sample k to k+1 and y at k, nan where lost, from the first known v on, or None."""
         v = self.commanded if self.reported is None else self.reported
         if v is None:
             return None
@@ -98,7 +98,7 @@ class Sampling(NamedTuple):
 
 
 def timing_of(heard: Heard, sample_period_s: float) -> Sampling:
-    """Sort out what came twice or early, and count the samples; none where they are too few."""
+    """Count the samples, without those that came twice or early; returns no rows if too few."""
     fields = [('value', 'f8'), ('stamp_ns', 'i8'), ('received_ns', 'i8'), ('number', 'u8')]
     sent = np.array(heard.outputs, fields)
     before = np.roll(sent, 1)
@@ -108,7 +108,7 @@ def timing_of(heard: Heard, sample_period_s: float) -> Sampling:
     again[:1] = False
     if again.sum() > 0.6 * len(sent):  # a plant at rest
         again[:] = False
-    # No gaps in the numbers where they were.
+    # What is left out is to leave no gap in the numbers.
     sent['number'] -= np.cumsum(again & ~same_number, dtype=np.uint64)
     sent = sent[~again]
     if len(sent) < FEWEST_SAMPLES:
@@ -122,7 +122,7 @@ def timing_of(heard: Heard, sample_period_s: float) -> Sampling:
     times = (stamps - stamps[0]) * 1e-9
     period = float(np.polyfit(numbers, times, 1)[0])
     lateness = float(np.ptp(np.quantile(times - period * numbers, [0.01, 0.99]))) / period
-    bursts = lateness > 0.5  # beyond 0.85 the controller takes it for a loss
+    bursts = lateness > 0.5  # the controller takes more than 0.85 for a loss
     # A driver that fell silent for good loses samples as well.
     silent = max(int((heard.end_ns - stamps[-1]) / rough) - 1, 0)
 
@@ -138,7 +138,7 @@ def timing_of(heard: Heard, sample_period_s: float) -> Sampling:
 
 
 class Judgement(NamedTuple):
-    """A line of the verdict: what was looked at, whether it fits, what was found, what helps."""
+    """A line of the verdict: what was checked, whether it fits, what was found, and the cure."""
 
     subject: str
     mark: str
@@ -147,7 +147,7 @@ class Judgement(NamedTuple):
 
 
 class Row(NamedTuple):
-    """What is said of a subject if it is wrong, which `hides` others; or else `well`, if any."""
+    """What to say of a subject if it is wrong, which hides others; or else `well`, if not empty."""
 
     subject: str
     wrong: object
@@ -158,12 +158,12 @@ class Row(NamedTuple):
 
 
 def judge(graph: Graph, heard: Heard, p: Parameters) -> list[Judgement]:
-    """All findings on a driver; p: parameters of the controller. Of a subject the first counts."""
+    """All findings on a driver, the first on each subject. p: parameters of the controller."""
     if not graph.publishers:
         return [Judgement('publisher', WRONG, 'nobody publishes plant_output', 'start the driver')]
     lines: dict[str, Judgement] = {}
     timing = timing_of(heard, p.sample_period)
-    # Amid jitter it is uncertain which v led to which y: what does not fit may do so.
+    # With jitter it is uncertain which v led to which y: what seems wrong may be right.
     blurred = ('reaction delay', 'G(z)', 'noise on y') if timing.bursts else ()
     for row in chain(_of_graph(graph, p), _of_messages(heard, timing, p),
                      _of_reports(heard, timing, p), _of_motion(timing, p)):
@@ -236,14 +236,14 @@ def _of_messages(heard: Heard, timing: Sampling, p: Parameters) -> Iterator[Row]
 
 
 def _lag_and_limit(timing: Sampling) -> tuple[int, float]:
-    """Samples by which applied_control follows control, and by how much it is limited, 0: not."""
+    """Samples by which applied_control lags control, and by how much it is limited, 0 if not."""
     control, applied = timing.commanded, timing.reported
     if control is None or applied is None:
         return 0, 0.0
     off = [np.abs(applied[lag:] - control[:len(control) - lag]) for lag in range(MORE_DELAY + 1)]
     off = [each[np.isfinite(each)] for each in off]
     lag = int(np.argmin([each.mean() if len(each) else inf for each in off]))
-    # What differs by more than 2 % of the swing was limited, but for 5 % of the samples.
+    # v is limited if more than 5 % of the samples differ by more than 2 % of the swing.
     beyond = off[lag] > 0.02 * (np.nanmax(control) - np.nanmin(control))
     return lag, float(off[lag].max()) if beyond.sum() > 0.05 * len(beyond) else 0.0
 
@@ -263,7 +263,7 @@ def _of_reports(heard: Heard, timing: Sampling, p: Parameters) -> Iterator[Row]:
 
 
 def _of_motion(timing: Sampling, p: Parameters) -> Iterator[Row]:
-    """What y does after the v that acted, by a fit of the whole record."""
+    """Judge how y follows the v that acted, by a fit of the whole record."""
     past = 'swing v wider than the gap in both directions, several times: check_driver --drive'
     if timing.record is None:
         yield Row('backlash', True, 'v was not heard', past, MOTION)
@@ -278,13 +278,13 @@ def _of_motion(timing: Sampling, p: Parameters) -> Iterator[Row]:
         yield Row('backlash', True, ''.join(fit.doubts[:1]), past, MOTION)
         return
     unseen = f'not identifiable from this motion: v swung by {np.ptp(v):.4g}'
-    # Without a turn of the play, lag and delay take up what the gap does.
+    # If the play never turns, lag and delay absorb the effect of the gap.
     explained = fit.predicted >= 0.9  # of the motion of y
     yield Row('backlash', fit.reversals == 0 and explained, f'{unseen} on one side', past, MOTION)
-    # A report that counts already has the lag by which it follows control.
+    # A report that is used contains the lag already.
     lag = 0 if report_use(p) == 'true' else _lag_and_limit(timing)[0]
     another_delay = fit.margins.get(expected - lag, inf) > 3.0  # log-likelihood
-    noisy = best.noise > 3.0 * noise_std  # by more than a guess may be off
+    noisy = best.noise > 3.0 * noise_std  # more than a guess may be off
     coloured = best.left.correlation > 0.5  # unlike the noise of a sensor
     predicted = f'predicts {max(fit.predicted, 0.0):.1%} of the motion of y'
     between, corrected = frequencies_of(y), predicted
@@ -292,7 +292,7 @@ def _of_motion(timing: Sampling, p: Parameters) -> Iterator[Row]:
         corrected += ' once it is corrected: it is off by ' + ', '.join(
             f'{error:.1%} at {frequency / (2.0 * pi * p.sample_period):.2g} Hz'
             for frequency, error in zip(between, fit.error_of_model(between), strict=True))
-    # A delay that nobody announced together with what is not noise is an odd G as well.
+    # An unexpected delay together with a large, coloured residual means a wrong G, too.
     yield Row('G(z)', not explained or (noisy and coloured and another_delay), predicted,
               'enter the G(z) of this plant, discretised with sample_period; see that y is '
               'measured behind the gap and that the driver holds v over the period', MOTION)
@@ -306,7 +306,7 @@ def _of_motion(timing: Sampling, p: Parameters) -> Iterator[Row]:
               well=f'{expected} samples, as control.delay_samples says')
     yield Row('sign and units', fit.against, ''.join(fit.against),
               'change the sign of y or v in the driver, or of plant.numerator')
-    # m alone counts while the others are not known.
+    # While the gap is in doubt, m alone is compared with its bounds.
     outside = [each for each in fit.outside if each.startswith('m ') or not fit.doubts]
     yield Row('sign and units', outside, ', '.join(outside), 'see the units of v, y and G(z) and '
               'the zero of v, or widen estimator.bounds',
@@ -319,12 +319,12 @@ def _of_motion(timing: Sampling, p: Parameters) -> Iterator[Row]:
 
 
 def all_fit(judgements: Iterable[Judgement]) -> bool:
-    """Whether nothing is wrong and nothing is left unknown."""
+    """Whether nothing is wrong or unknown."""
     return all(each.mark == FITS for each in judgements)
 
 
 def table(judgements: Sequence[Judgement]) -> str:
-    """A line per finding, the cure below what is wrong."""
+    """One line for each finding, with the cure below if something is wrong."""
     width = max(len(each.subject) for each in judgements)
     return '\n'.join(
         f'{each.mark} {each.subject.ljust(width)}  {each.found}'

@@ -1,4 +1,4 @@
-"""ROS 2 nodes. Importing them takes a while, in which a signal has to end the process as well."""
+"""ROS 2 nodes. Importing them takes a while, during which a signal has to end the process, too."""
 
 import os
 import signal
@@ -12,7 +12,7 @@ if sys.argv and os.path.basename(sys.argv[0]) in (
 ):
     for _number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(_number, lambda number, frame: os._exit(0))
-    # Whoever starts a node may hold them back until here, where they end it well.
+    # A parent process may block the signals until here, from where on they end the node cleanly.
     signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT, signal.SIGTERM))
     if ros_is_missing():
         sys.exit(ROS_MISSING)

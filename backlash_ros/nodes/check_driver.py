@@ -1,6 +1,6 @@
-"""Node that judges a driver: it listens, moves it gently if told to, and says what does not fit.
+"""Judge a driver: listen, move v gently if --drive is given, and report what does not fit.
 
-For `identify --drive` it moves v, and writes what it hears and sends instead of judging it.
+For `identify --drive`, move v and write all messages to a file instead of judging them.
 """
 
 import argparse
@@ -46,9 +46,9 @@ LOOK_S = 0.1  # between two looks at the graph
 
 
 class CheckDriverNode(ProcessNode):
-    """Hears a driver and says what does not fit; the parameters are those of the controller.
+    """Listens to a driver and reports what does not fit, with the parameters of the controller.
 
-    ended: why it stopped listening before its time.
+    ended: why listening stopped early, '' if it did not.
     """
 
     ended = ''
@@ -57,8 +57,8 @@ class CheckDriverNode(ProcessNode):
         super().__init__(program, parameters_of=CONTROLLER)
         build_controller(self.settings)
         self.options, self.heard = options, driver_check.Heard()
-        self._graph = driver_check.Graph()  # with the most of them that were there at once
-        # A line at a time, for `identify` reads it meanwhile.
+        self._graph = driver_check.Graph()  # the newest with the most publishers, listeners
+        # Flushed after each line, as `identify` reads the file meanwhile.
         self._file = open(options.messages or os.devnull, 'w', 1, encoding='ascii')  # noqa: SIM115
 
     def work(self, executor: PromptExecutor) -> None:
@@ -80,7 +80,7 @@ class CheckDriverNode(ProcessNode):
         self.listen_until(lambda: time.monotonic() > end, executor)
 
     def hear(self, topic: str, answer: Callable[[float], None] = lambda value: None) -> None:
-        """Subscribe the way that hears whoever publishes, whatever the QoS."""
+        """Subscribe so that all publishers are heard, whatever their QoS."""
         def on_message(message: Float64, info: dict[str, Any]) -> None:
             answer(message.data)
             self.note(topic, driver_check.Message(
@@ -103,12 +103,12 @@ class CheckDriverNode(ProcessNode):
         self.heard.end_ns = time.time_ns()
 
     def look(self) -> None:
-        """Take note of who is there."""
+        """Update the graph of publishers and subscribers."""
         self._graph = max(graph_around(self), self._graph,
                           key=lambda graph: (graph.publishers, graph.listeners))
 
     def tell(self) -> int:
-        """Say what came of it; returns the exit code."""
+        """Print the findings; returns the exit code."""
         findings = driver_check.judge(self._graph, self.heard, self.settings)
         if self.ended:
             findings.append(driver_check.Judgement(
@@ -138,27 +138,27 @@ class CheckDriverNode(ProcessNode):
 
 
 class DriveNode(CheckDriverNode):
-    """Moves v besides: a control for every plant_output, from the v that acts, to rest at the end.
+    """Moves v as well: one control for each plant_output, from the v that acts, to rest at the end.
 
-    It waits until everybody has found everybody and somebody listens. Whatever ends the motion, v
-    is brought to rest. rivals: who else moves v.
+    It waits for discovery and for a subscriber of control. Whatever ends the motion, v is brought
+    to rest. rivals: other publishers of control.
     """
 
     def __init__(self, program: str, options: argparse.Namespace) -> None:
         super().__init__(program, options)
         self._limits = drive_limits(self.settings, options.amplitude, options.rate)
-        self._motion: Drive | None = None  # v on its way
-        self._newest_at = inf  # the newest y came
+        self._motion: Drive | None = None  # once v moves
+        self._newest_at = inf  # when the newest y came
         self._answers = False
         self.rivals = ''
 
     def follow(self, executor: PromptExecutor) -> None:
-        """Listen until v has had all the samples of the duration, late ones as well, or no more."""
+        """Listen until v has moved for all samples of the duration, or for twice the duration."""
         self.hear(topics.APPLIED_CONTROL)
         self._control = self.create_publisher(Float64, topics.CONTROL, DEPTH)
         self._lock = CommandLock(
             self.context.get_domain_id(), self.resolve_topic_name(topics.CONTROL))
-        self._settled_at = time.monotonic() + 1.0  # everybody found everybody
+        self._settled_at = time.monotonic() + 1.0  # discovery has ended
         self.hear(topics.PLANT_OUTPUT, self._answer)
         duration_s = self.options.duration
         enough = duration_s / self.settings.sample_period
@@ -170,7 +170,7 @@ class DriveNode(CheckDriverNode):
             self._come_to_rest()
 
     def look(self) -> None:
-        """Take note of who else is there. Once heard, a rival counts, even if it leaves."""
+        """Look for listeners and rivals as well. A rival counts even if it has left again."""
         super().look()
         rivals = {name_of(info) for info in publishers(self, topics.CONTROL)}
         now, p = time.monotonic(), self.settings
@@ -202,7 +202,7 @@ class DriveNode(CheckDriverNode):
         return FAILED
 
     def _answer(self, y: float) -> None:
-        """Move v on by a sample, unless it has to wait or the motion has ended."""
+        """Answer y with the next v, unless the motion has to wait or has ended."""
         self._newest_at = time.monotonic()
         if self.rivals or not self._answers:
             return
@@ -219,7 +219,7 @@ class DriveNode(CheckDriverNode):
         self.note(topics.CONTROL, driver_check.Message(v, now, now, 0))
 
     def _v_at_start(self) -> float:
-        """The v that acts before the motion, 0 where nobody says it."""
+        """The v that acts before the motion, 0 if nothing tells it."""
         p = self.settings
         known = p.control.initial if plausible(p.control.initial) else None
         for message in self.heard.applied[-1:]:
@@ -231,7 +231,7 @@ class DriveNode(CheckDriverNode):
         return known or 0.0
 
     def _come_to_rest(self) -> None:
-        """Bring v to rest, or hold it where that takes too long or another signal comes."""
+        """Bring v to rest, or hold it if that takes too long or another signal comes."""
         if self._motion is None:
             return
         before, deadline = len(self.signals), time.monotonic() + self.options.rest
@@ -245,7 +245,7 @@ class DriveNode(CheckDriverNode):
                     else 'another signal came'
                 self.say(f'v is held at {v:.6g}: {why}')
                 break
-        # A busy machine may lose a message, and this one is to be heard before the node leaves.
+        # A busy machine may lose a message, but the driver must get this one before the node ends.
         for _ in range(10):
             self._control.publish(Float64(data=v))
             if self._control.wait_for_all_acked(Duration(seconds=0.1)):
@@ -254,13 +254,13 @@ class DriveNode(CheckDriverNode):
 
 
 def publishers(node: Node, topic: str) -> list[TopicEndpointInfo]:
-    """Who else publishes a topic."""
+    """The publishers of a topic other than this node."""
     return [info for info in node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
             if info.node_name != node.get_name()]
 
 
 def graph_around(node: Node) -> driver_check.Graph:
-    """Who is there now and, where nobody listens to v, which topics may have been meant for it."""
+    """The present graph and, if nobody listens to v, topics that may be meant to be control."""
     control = node.resolve_topic_name(topics.CONTROL)
     outputs = publishers(node, topics.PLANT_OUTPUT)
     listeners = _others(node, node.get_subscriptions_info_by_topic(control))
@@ -272,7 +272,7 @@ def graph_around(node: Node) -> driver_check.Graph:
 
 
 def say_what_is_missing(node: Node) -> None:
-    """Say which topic is waited for, and which ones there are."""
+    """Print which topic is waited for, and which topics there are."""
     wanted = node.resolve_topic_name(topics.PLANT_OUTPUT)
     seen = _topics(node, node.get_publishers_info_by_topic)
     others = ', '.join(sorted(seen)) or 'no topic'
@@ -285,13 +285,13 @@ def say_what_is_missing(node: Node) -> None:
 def _topics(
     node: Node, endpoints: Callable[[str], list[TopicEndpointInfo]],
 ) -> dict[str, list[str]]:
-    """Topics that others have such endpoints of, with their types, but for those of ROS."""
+    """Topics with such endpoints of other nodes, and their types, but for those of ROS itself."""
     return {topic: types for topic, types in node.get_topic_names_and_types()
             if topic not in ('/rosout', '/parameter_events') and _others(node, endpoints(topic))}
 
 
 def _others(node: Node, endpoints: Sequence[TopicEndpointInfo]) -> list[TopicEndpointInfo]:
-    """Without those of this node, of the recorder and of `ros2 topic`."""
+    """The endpoints without those of this node, of the recorder and of `ros2 topic`."""
     return [info for info in endpoints if info.node_name not in (node.get_name(), RECORDER)
             and not info.node_name.startswith('_ros2cli')]
 
@@ -302,14 +302,14 @@ def _has_best_effort(endpoints: Sequence[TopicEndpointInfo]) -> bool:
 
 def _misfit(asked: QoSProfile) -> str:
     """Why messages cannot pass from control to a subscriber, empty if they can."""
-    # What discovery does not tell (depth) or tells as "infinite" would count as a misfit.
+    # Discovery does not tell the depth and tells "infinite" durations, which would not fit.
     bare = QoSProfile(depth=DEPTH, reliability=asked.reliability, durability=asked.durability)
     compatibility, reason = qos_check_compatible(QoSProfile(depth=DEPTH), bare)
     return f'control: {reason}' if compatibility == QoSCompatibility.ERROR else ''
 
 
 def similar_topics(wanted: str, seen: Iterable[str]) -> tuple[str, ...]:
-    """Topics that may be the wanted one under another name, by the last part of it."""
+    """Topics whose last name is similar to that of the wanted one."""
     last = wanted.rpartition('/')[2]
     return tuple(topic for topic in sorted(seen) if topic != wanted and
                  difflib.SequenceMatcher(None, last, topic.rpartition('/')[2]).ratio() >= 0.6)
@@ -321,15 +321,15 @@ def parse_options(plain: Sequence[str]) -> argparse.Namespace:
     parser.add_argument('--config', metavar='FILE', help='ROS 2 parameter file of the controller, '
                         'or the name of a shipped one')
     parser.add_argument('--drive', action='store_true', help='move v, to and fro within '
-                        'the limits of control, to rest at the end')
+                        'the limits of control, and end at rest')
     parser.add_argument('--save', type=Path, metavar='FILE', help='write t,v,y as CSV')
-    # Of `identify`: a line for each message, with topic, time stamp [ns] and value.
+    # For `identify`: a line for each message, with topic, time stamp [ns] and value.
     parser.add_argument('--messages', help=argparse.SUPPRESS)
     add_motion_options(parser, 10.0, 'how long to listen')
     options = parser.parse_args(plain)
     for name in ('amplitude', 'rate'):
         if getattr(options, name) is not None and not options.drive:
-            parser.error(f'--{name} says how to drive: give --drive as well')
+            parser.error(f'--{name} needs --drive')
     return options
 
 
@@ -343,7 +343,7 @@ def main(args: list[str] | None = None) -> int:
         if options.config is not None:
             config = find_config(Path(options.config))
             meant = Path(folder) / config.name
-            # Sections for the controller are for this node. What is broken, rcl says of the file.
+            # Sections for the controller are for this node. rcl reports errors in the file itself.
             with suppress(OSError):
                 meant.write_bytes(re.sub(rb'(?m)^(\S*)\bcontroller(?=["\']?:)',
                                          rb'\1' + program.encode(), config.read_bytes()))

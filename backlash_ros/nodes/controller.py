@@ -33,11 +33,11 @@ from backlash_ros.nodes.runtime.process import ProcessNode, emit, run
 
 
 class ControllerNode(LifecycleNodeMixin, ProcessNode):
-    """Answers every plant_output with a control; estimates and signals follow after it.
+    """Answers every plant_output with a control, then publishes estimates and signals.
 
     A managed node. In lockstep the k-th tick of /clock, reference and plant_output belong together,
-    so that runs are repeatable; else the newest reference counts. With `joints` there is a loop for
-    each of them: a message has y of all, and one with v of all answers it.
+    which makes runs repeatable; otherwise the newest reference is used. With `joints` each has a
+    loop of its own: a message with y of all joints is answered by one with v of all.
     """
 
     reconfigurable = True
@@ -50,21 +50,21 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
         check_style(p)
         self.active = False
         self._io = DriverIo(self)
-        # Whoever waits for the others begins with them; who does not may have been restarted.
+        # Samples count from 0 if it waits for the others; otherwise it may have been restarted.
         counter = SampleCounter(
             p.sample_period, from_zero=not p.lockstep and p.wait_for_subscribers > 0
         )
-        # Raises ParameterError before anybody is found. While unconfigured they are not used.
+        # Not used while unconfigured: made now to raise any ParameterError before discovery.
         self.loops = JointLoops(p, self._io.publish, self._io.driver_of, {}, counter, {
-            # In lockstep there is the simulated plant alone, which begins at 0.
+            # In lockstep the only plant is the simulated one, which begins at 0.
             joint: initial if isfinite(initial) and not p.lockstep else None
             for joint in p.joint_names for initial in [p.of_joint(joint).control.initial]
         })
-        # A fit that shared the process of the loop would hold up its commands.
+        # Fits have processes of their own, as they would delay the commands of the loop.
         self._executor = Executor() if p.lockstep else \
             WorkerExecutor(assembly.WORKER_MODULES, len(p.joint_names))
         if not p.lockstep:
-            # The first command begins with what the driver reports, even if it is not learned from.
+            # The first command starts from the reported v, even if estimation does not use reports.
             self._io.listen_to(self._io.topics.applied, self._on_report, KEPT_COMMANDS)
         # Lockstep: ticks of /clock [ns], references and outputs that wait for each other.
         self._waiting: tuple[deque[Any], ...] = deque(), deque(), deque()
@@ -73,8 +73,8 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
         to = self._io.topics
         self._rivals = RivalWatch(self, self._io, self._mind_rivals)
         self._steps = StepPublisher(self, p.joint_names)
-        # A stalled controller goes on with the newest values; in lockstep none may be skipped.
-        # Woken by each y_m, the process would take half as much time again.
+        # After a stall the newest reference is used; in lockstep none may be skipped. Polled, as a
+        # wake-up for each y_m would cost half as much processor time again.
         self._io.listen_to(
             to.reference, self._on_reference, KEPT_QOS if p.lockstep else 1, polled=not p.lockstep,
         )
@@ -86,7 +86,7 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
 
         def look_and_tell() -> None:
             self._steps.look()
-            self._diagnose(next(turns))  # one at a time: all at once would hold up a command
+            self._diagnose(next(turns))  # one at a time: all at once would delay a command
 
         self.every(DIAGNOSTICS_PERIOD_S / len(self.joints), look_and_tell)
         if p.lockstep:
@@ -99,8 +99,8 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
             if assembly.takes_model_as_exact(joint.p):
                 self.log.info(line_of(
                     joint.name, 'plant.uncertainty is 0: G is taken as exact, which no data can '
-                    'check. Where it is not, estimates are off by more than their deviations: 0.2 '
-                    'allows for time constants that are 20 % off'
+                    'check. If it is not, estimates are off by more than their standard deviations:'
+                    ' 0.2 allows for time constants that are 20 % off'
                 ))
         name = self.resolve_topic_name
         self.log.info(
@@ -121,7 +121,7 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
             v = {name: loop.v if loop.knows_v else None for name, loop in loops.by_name.items()}
             self.loops = JointLoops(self.settings, io.publish, io.driver_of, {}, loops.counter, v,
                                     self._executor)
-        except ParameterError as error:  # rclpy itself would swallow it without a word
+        except ParameterError as error:  # rclpy would swallow it silently
             self.log.error(str(error))
             return TransitionCallbackReturn.FAILURE
         self.configured = True
@@ -140,8 +140,8 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
         self.active = True
         self._rivals.follow(active=True)
         for loop in self.loops.loops:
-            # That nobody was listened to is no silence of the driver. v goes on from the last
-            # command, but what the plant did meanwhile is unknown.
+            # While inactive the node did not listen: that is no silence of the driver. v continues
+            # from the last command, but what the plant did meanwhile is unknown.
             loop.heard.y_at = nan
             if loop.statistics.used:
                 loop.renew(loop.estimate)
@@ -162,7 +162,7 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
         super().work(executor)
 
     def _are_all_there(self) -> bool:
-        """Whether everybody is found that may be there: beside the driver those who hear it all."""
+        """Whether all awaited nodes are found: the driver, and those that hear every topic."""
         lockstep, io = self.settings.lockstep, self._io
         wanted = max(self.settings.wait_for_subscribers, int(lockstep))
         return (lockstep or time.monotonic() >= self._rivals.settled_at) and (not wanted or (
@@ -176,7 +176,7 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
         if self.active:
             self.active = False
             if any(loop.statistics.used for loop in self.loops.loops):
-                # Before a ramp: whoever stops this process may not wait for its end.
+                # Saved before a ramp, during which the process may be killed.
                 for joint in self.joints:
                     joint.save()
                 self.loops.end(self.settings.on_stop)
@@ -190,7 +190,7 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
     on_shutdown = on_deactivate
 
     def _send_last(self) -> None:
-        """Send what ends all loops; v is held where that takes too long, or SIGKILL comes next."""
+        """Send the last commands; hold v after timeout.ramp, or on SIGTERM as a second signal."""
         p, told, why = self.settings, time.monotonic(), ''
         step_s, deadline = max(p.sample_period, 1e-3), told + p.timeout.ramp
         while self.loops.send_next():
@@ -205,7 +205,7 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
             time.sleep(step_s)
             if time.monotonic() > told + DIAGNOSTICS_PERIOD_S:
                 told = time.monotonic()
-                self._diagnose()  # so that who stands down does not take this node for gone
+                self._diagnose()  # or a controller that stands down would think it gone
         self._io.publisher.wait_for_all_acked(Duration(nanoseconds=100_000_000))
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -243,18 +243,18 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
         if steps and (turn or self._steps.heard):
             period_s = self.settings.sample_period
             if next(iter(outputs.values())).received_ns > self._io.now_ns() - period_s * 1e9:
-                # On a busy processor the driver, woken by the command, would have to wait.
+                # Let the driver, which the command wakes up, have a busy processor first.
                 time.sleep(0.05 * period_s)
             if turn:
                 turn.core.refine()
             self._follow_up(steps)
 
     def _pair(self, which: int, came: int | Mapping[str, float] | Output) -> None:
-        """Lockstep: answer as soon as tick, reference and output of a sample are there."""
+        """Lockstep: answer as soon as the tick, reference and output of a sample have come."""
         ticks, references, outputs = self._waiting
         self._waiting[which].append(came)
         while self.active and all(self._waiting):
-            # A tick is the sample: messages are not told apart by number then.
+            # The tick tells the sample, not the sequence number of the message.
             output = outputs.popleft()._replace(
                 sequence=sample_counter.UNNUMBERED, stamp_ns=ticks.popleft()
             )
@@ -321,7 +321,7 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
             self._ending = None
 
     def _diagnose(self, *joints: Joint) -> None:
-        # The graph and the times of messages are looked at once for all of them.
+        # The graph and the timing of messages are read once for all joints.
         if not joints or joints[0] is self.joints[0]:
             rivals = tuple(rival.name for rival in self._rivals.found)
             self._around = (

@@ -1,4 +1,4 @@
-"""Controllers that run: found by what they publish, their state, their newest messages."""
+"""Follow running controllers, found by what they publish: their state and newest messages."""
 
 import os
 import re
@@ -23,10 +23,10 @@ from backlash_ros.topics import BACKLASH
 
 
 class ControllerState:
-    """One controller, or a joint of it.
+    """The state of one controller, or of a joint of it.
 
-    estimates: value and half width of its band of two deviations. watched: by label, the time of
-    arrival [ns] and the value of what came at the last look.
+    estimates: value and two standard deviations. watched: by label, the time of arrival [ns] and
+    the value of each message taken at the last look.
     """
 
     def __init__(self, node: str, joint: str = '') -> None:
@@ -41,8 +41,8 @@ class ControllerState:
         self.events: deque[tuple[str, str]] = deque(maxlen=20)
 
     def hear(self, message: str, level: int, values: dict[str, str], now_s: float) -> None:
-        """Take in what /diagnostics says of it; a text that has changed is an event."""
-        # A text in which a figure has changed tells nothing new.
+        """Take a status from /diagnostics; a changed text is noted as an event."""
+        # A text in which only a figure has changed is not new.
         before, after = (re.sub(r'[\d.]+', '', text) for text in (self.message, message))
         if after != before:
             self.note(message)
@@ -70,13 +70,13 @@ class ControllerState:
 
     @property
     def silent_s(self) -> float:
-        """How long nothing was heard of it, 0 as long as that means nothing."""
+        """How long it has been silent [s]; 0 if that is not unusual yet."""
         passed = time.monotonic() - self._heard_at_s
         return passed if SILENT_S < passed < inf else 0.0
 
     @property
     def level(self) -> int:
-        """0 well, 1 warning, 2 error; nobody knows how somebody is who says nothing any more."""
+        """0 well, 1 warning, 2 error or silent."""
         return 2 if self.silent_s else self._level
 
     @property
@@ -85,16 +85,16 @@ class ControllerState:
             return 'no diagnostics yet'
         if silent_s := self.silent_s:
             return f'silent for {silent_s:.0f} s'
-        # What the estimates were when it was deactivated is no state of the controller.
+        # The state of the estimates at deactivation is not the state of the controller.
         beginning = self.message.partition(':')[0]
         return beginning if beginning == 'inactive' else self.values.get('state') or beginning
 
 
 class ViewerNode(ProcessNode):
-    """Knows every controller of the domain, or those of the wanted namespaces.
+    """Finds and follows all controllers of the domain, or those of the wanted namespaces.
 
-    labels: which of the messages below `controller/watch` to take. states: by name, in the order in
-    which they were found.
+    labels: which messages below `controller/watch` to take. states: by name, in the order in which
+    the controllers were found.
     """
 
     def __init__(self, name: str, wanted: Sequence[str], labels: Sequence[str]) -> None:
@@ -111,7 +111,7 @@ class ViewerNode(ProcessNode):
         self._find()
 
     def take_messages(self) -> None:
-        """Take in what has come since the last call: nothing wakes up for each message."""
+        """Take all messages since the last call; the process is not woken up for each of them."""
         serve_polled(self._diagnostics)
         for state in self.states.values():
             state.watched.clear()
@@ -123,16 +123,16 @@ class ViewerNode(ProcessNode):
             state.hear(status.message, ord(status.level), values, time.monotonic())
 
     def _find(self) -> None:
-        """Whoever publishes what a controller publishes is one."""
+        """Find new controllers by the topics that they publish."""
         for topic, _ in sorted(self.get_topic_names_and_types()):
-            # By this a controller is known, or a joint of it.
+            # Every controller, or joint of it, has this topic.
             found = re.fullmatch(rf'(.*)/watch/(?:([^/]+)/)?{BACKLASH[0]}', topic)
             if found is None or not f'{found[1]}/'.startswith(self._wanted):
                 continue
             state = ControllerState(found[1], found[2] or '')
             if state.name not in self.states:
                 folder = topic.removesuffix(BACKLASH[0])
-                # A machine that is held up for a second loses no point.
+                # Deep enough that a stall of a second loses no point.
                 state.subscriptions = [self.listen(
                     Float64, folder + label, partial(state.hear_value, label), 30, polled=True
                 ) for label in self._labels]
@@ -148,9 +148,9 @@ def viewer_options(name: str, description: str | None, epilog: str) -> OptionPar
 
 
 def give_way() -> None:
-    """Let the loop come first; before a thread is started, which inherits it."""
+    """Lower the priority below that of the loop. Call it first, as threads inherit it."""
     os.nice(10)
-    # Niceness counts only among the processes of one session, see autogroup in sched(7). In this
-    # class whoever wakes up does not interrupt one that runs, whatever session that is of.
+    # Niceness counts only among the processes of one session, see autogroup in sched(7). A process
+    # of this class that wakes up interrupts none that runs, of whatever session.
     with suppress(OSError):  # some containers do not allow it
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))

@@ -1,6 +1,6 @@
-"""Shows running controllers on a page in the browser: state, estimates, moving curves.
+"""Show running controllers on a page in the browser: state, estimates, moving curves.
 
-The page is served to this machine alone, at an address that is printed.
+The page is served to this machine only, at an address that is printed.
 """
 
 import json
@@ -29,9 +29,9 @@ LIVE_LABELS = tuple(
 
 
 class PageServer(ThreadingHTTPServer):
-    """Answers each browser in a thread of its own, so that a slow one holds up nobody.
+    """Answers each browser in a thread of its own, so that a slow one does not delay the others.
 
-    frames: of the last shown_s [s], each with its time, the state and the new points of curves.
+    frames: those of the last shown_s [s], each with its time, the state and new points of curves.
     """
 
     daemon_threads = True
@@ -44,13 +44,13 @@ class PageServer(ThreadingHTTPServer):
 
 
 class PageRequest(BaseHTTPRequestHandler):
-    """What a browser asks for: the page, and /frames, what is to be shown there and then."""
+    """Serves the page, and /frames, a stream of what the page is to show."""
 
     server: PageServer
-    timeout = 10.0  # [s] for a browser that has fallen silent
+    timeout = 10.0  # [s] until a silent browser is given up
 
     def do_GET(self) -> None:
-        # A page from elsewhere may let a name of its own point here, and read along.
+        # Against DNS rebinding: another site's name may point here, to read the data.
         if self.headers.get('Host', '').partition(':')[0] not in (HOST, 'localhost'):
             self.send_error(HTTPStatus.FORBIDDEN, f'only {HOST} is served')
             return
@@ -65,7 +65,7 @@ class PageRequest(BaseHTTPRequestHandler):
             self.wfile.write(Path(__file__).with_suffix('.html').read_bytes())
 
     def _send_frames(self) -> None:
-        """Send the newest state and all curves, and then what is new, as events of a stream."""
+        """Send the newest state and all curves, then whatever is new, as server-sent events."""
         sent = 0.0
         while True:
             missing = [frame for frame in self.server.frames.copy() if frame[0] > sent]
@@ -80,11 +80,11 @@ class PageRequest(BaseHTTPRequestHandler):
             super().handle()
 
     def log_message(self, *message: Any) -> None:
-        """Nobody reads of each request."""
+        """Do not log requests: nobody would read that."""
 
 
 class LiveNode(ViewerNode):
-    """Shows the controllers that are wanted."""
+    """Shows the wanted controllers on the page of a server."""
 
     def __init__(self, wanted: Sequence[str], server: PageServer) -> None:
         super().__init__('live', wanted, LIVE_LABELS)
@@ -114,7 +114,7 @@ class LiveNode(ViewerNode):
 
 
 def rounded(value: float) -> float | None:
-    """A number for JSON, which has no nan: None."""
+    """A number for JSON; None instead of nan and inf, which JSON lacks."""
     return float(f'{value:.7g}') if isfinite(value) else None
 
 

@@ -1,6 +1,6 @@
-"""Shows running controllers in a terminal: state, estimates, excitation, latency, what happens.
+"""Show running controllers in a terminal: state, estimates, excitation, latency, events.
 
-Without a terminal a line per controller is printed once a second.
+Without a terminal, one line per controller is printed every second.
 """
 
 import os
@@ -32,16 +32,16 @@ from backlash_ros.nodes.runtime.process import run, split_arguments
 from backlash_ros.topics import BACKLASH
 
 SCREEN_PERIOD_S, NOTICE_S = 0.2, 3.0
-# By key: the service, and the switch of the diagnostics that it turns over.
+# By key: the service, and the entry of /diagnostics that it toggles.
 ACTIONS = {
     'f': ('freeze_adaptation', 'learning'), 'c': ('enable_compensation', 'compensating'),
     'r': ('reset_estimates', ''), 's': ('save_estimates', ''),
 }
-EXCITATION = 'excitation: swing of v / gap'  # among the values of diagnostics
+EXCITATION = 'excitation: swing of v / gap'  # entry of /diagnostics
 
 
 class MonitorNode(ViewerNode):
-    """Shows the controllers that are wanted, and asks the services of the selected one."""
+    """Shows the wanted controllers and calls services of the selected one."""
 
     def __init__(self, wanted: Sequence[str]) -> None:
         super().__init__('monitor', wanted, BACKLASH)
@@ -51,7 +51,7 @@ class MonitorNode(ViewerNode):
 
     def work(self, executor: PromptExecutor) -> None:
         if isinstance(sys.stdout, TextIOWrapper):
-            sys.stdout.reconfigure(errors='replace')  # whatever a terminal cannot show
+            sys.stdout.reconfigure(errors='replace')  # for terminals without ±
         console = Console()
         try:
             if console.is_terminal and not console.is_dumb_terminal:
@@ -60,7 +60,7 @@ class MonitorNode(ViewerNode):
                 self.every(1.0, self._print_lines)
                 super().work(executor)
         except BrokenPipeError:
-            # Python would complain of it once more when it flushes at its end.
+            # Otherwise Python reports it again when it flushes at exit.
             sys.stdout = open('/dev/null', 'w')  # noqa: SIM115
 
     def _print_lines(self) -> None:
@@ -100,7 +100,7 @@ class MonitorNode(ViewerNode):
         self._notice, self._notice_ends_s = text, time.monotonic() + NOTICE_S
 
     def _ask(self, state: ControllerState, service: str, switch: str) -> None:
-        """Ask a service, whose answer is an event."""
+        """Call a service; its answer is noted as an event."""
         name, on = f'{state.node}/{service}', not state.is_on(switch)
         request: Any = Trigger.Request()
         if switch:
@@ -125,7 +125,7 @@ class MonitorNode(ViewerNode):
 def screen(
     states: Sequence[ControllerState], selected: int, notice: str, height: int,
 ) -> Layout:
-    """All controllers; where there is no room, all but the selected one in a line each."""
+    """All controllers; if there is no room, those not selected get a line each."""
     several, footer_lines, panel_lines = len(states) > 1, 2, 10
     every = len(states) * panel_lines <= height - footer_lines
     rows = [
@@ -181,7 +181,7 @@ def _with_band(state: ControllerState, name: str, width: int = 0) -> str:
 
 @contextmanager
 def pressed_keys() -> Iterator[Callable[[], str]]:
-    """A function that returns what was pressed since its last call, on a terminal."""
+    """Yield a function that returns the keys pressed on the terminal since its last call."""
     if not sys.stdin.isatty():
         yield lambda: ''
         return
@@ -192,7 +192,7 @@ def pressed_keys() -> Iterator[Callable[[], str]]:
         if not select.select([descriptor], [], [], 0.0)[0]:
             return ''
         text = os.read(descriptor, 100).decode(errors='ignore')
-        # Arrows and function keys come as sequences of which a part looks like other keys.
+        # Arrows and function keys come as sequences, parts of which look like other keys.
         return re.sub(r'\x1b(\[|O)[0-9;]*.?', '', text)
 
     try:
@@ -205,8 +205,8 @@ def pressed_keys() -> Iterator[Callable[[], str]]:
 def main(args: list[str] | None = None) -> int:
     plain, of_ros = split_arguments(args)
     options = viewer_options(
-        'monitor', __doc__, 'keys: f freezes or goes on learning, c compensates or not, r (twice) '
-        'resets the estimates,\n      s saves them, Tab takes the next controller, q ends.',
+        'monitor', __doc__, 'keys: f freezes or resumes learning, c turns compensation on or off, '
+        'r (twice) resets\n      the estimates, s saves them, Tab selects the next one, q quits.',
     ).parse_args(plain)
     return run('monitor', lambda: MonitorNode(options.name), of_ros)
 

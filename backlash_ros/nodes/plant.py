@@ -1,4 +1,4 @@
-"""Node that simulates the plant: backlash, then G(z), then a sensor (3.1)."""
+"""Node that simulates the plant: backlash, then G(z), then a sensor, equation (3.1)."""
 
 import sys
 import time
@@ -23,11 +23,11 @@ from backlash_ros.nodes.runtime.process import ProcessNode, emit, run
 
 
 class PlantNode(ProcessNode):
-    """Publishes y(k) and applies the newest v, which causes y(k+1) together with the state.
+    """Publishes y(k) and applies the newest v until y(k+1).
 
-    Real time: every sample period; what comes too late, because the process was held up, is left
-    out. Lockstep: as soon as v(k) is there; /clock tells the simulated time before every output.
-    An output that is lost on purpose has no tick of /clock, which shows the gap.
+    Real time: every sample period; an output that is late, because the process was held up, is left
+    out. Lockstep: as soon as v(k) has come; /clock tells the simulated time before every output.
+    An output that is lost on purpose has no tick of /clock, so that the loss shows.
     """
 
     def __init__(self) -> None:
@@ -36,10 +36,10 @@ class PlantNode(ProcessNode):
         self._plant = build_plant(p)
         # The same draws as in a simulation in one process, so that runs agree to the last bit.
         self._loss_rng = np.random.default_rng([p.seed, 1])
-        self._commands = CommandHistory(p.sample_period)  # that came, by the monotonic clock
+        self._commands = CommandHistory(p.sample_period)  # by time of arrival, monotonic clock
         self._commands.publish(0.0, 0)
         self._expecting = False  # no v has come since the newest output
-        self._published: Counter[str] = Counter()  # what a recorder can have heard
+        self._published: Counter[str] = Counter()  # messages by topic, and samples
         self._applied, self._output = (
             self.create_publisher(Float64, topic, messages.DEPTH)
             for topic in (topics.APPLIED_CONTROL, topics.PLANT_OUTPUT)
@@ -55,7 +55,7 @@ class PlantNode(ProcessNode):
                       f'sample_period {p.sample_period:g} s')
 
     def _is_heard(self) -> bool:
-        """Whether enough listen; one of several is a recorder, which wants everything."""
+        """Whether enough nodes listen; if several are wanted, one is a recorder of all topics."""
         wanted = max(self.settings.wait_for_subscribers, int(self.settings.lockstep))
         of_recorder = min(self._truth.listeners, self._applied.get_subscription_count())
         return self._output.get_subscription_count() >= wanted and of_recorder >= int(wanted > 1)
@@ -88,40 +88,40 @@ class PlantNode(ProcessNode):
             self._answer(v)
 
     def _answer(self, *acted: float) -> None:
-        """Lockstep: go on to the next output that is not lost on purpose."""
+        """Lockstep: advance to the next output that is not lost on purpose."""
         while not self._go_on(acted):
             acted = (self._commands.at(inf)[0],)
 
     def _keep_time(self, executor: PromptExecutor) -> None:
-        """Real time: go on at absolute deadlines."""
+        """Real time: advance at absolute deadlines."""
         period_ns = self.settings.sample_period * 1e9
         start, tick = time.monotonic_ns(), 0
         self._go_on(())
         while not (self.stopping or self._complete):
             remaining = start + (tick + 1) * period_ns - time.monotonic_ns()
             if remaining <= 0:
-                # What has arrived in time counts, even if nobody has looked at it yet.
+                # A command that has arrived in time counts, even if it was not taken yet.
                 executor.serve_urgent(0)
-                # More than one where the process was held up past a deadline.
+                # More than one if the process was held up past a deadline.
                 passed = max(int((time.monotonic_ns() - start) / period_ns) - tick, 1)
                 tick += passed
                 due_ns = start + int(tick * period_ns)
-                # Some of these intervals may have been over before v came; all that has come so far
-                # came within the newest one. Later than latest_ns y would look like the next one.
+                # v of a missed interval is that which had come by its end. Published later than
+                # latest_ns, y would look like the next sample.
                 self._go_on([
                     self._commands.at(due_ns - missed * period_ns if missed else inf)[0]
                     for missed in reversed(range(passed))
                 ], latest_ns=due_ns + 0.75 * period_ns)
                 executor.look_if_due()
-            elif remaining >= 3_000_000:  # a wait of the executor costs more than less leaves
+            elif remaining >= 3_000_000:  # spin_once takes too long for a shorter wait
                 executor.spin_once(timeout_sec=remaining * 1e-9)
             else:
                 executor.serve_urgent(int(remaining))
 
     def _go_on(self, acted: Sequence[float], latest_ns: float = inf) -> bool:
-        """Apply a v over each period that has passed, and publish y, all else after it has left.
+        """Apply one v over each period that has passed and publish y, then all else.
 
-        Returns whether it has left, or the run is complete.
+        Returns whether y was published or the run is complete.
         """
         rows = [self._advance(v) for v in acted if not self._complete]
         finished = self._complete or self._publish_output(latest_ns)
@@ -133,14 +133,14 @@ class PlantNode(ProcessNode):
         return finished
 
     def _advance(self, v: float) -> tuple[float, ...]:
-        """Let v act over a period; returns the row of the truth of it."""
+        """Let v act over a period; returns the row of the topic TRUTH for it."""
         plant, sample = self._plant, self._plant.sample
         u, truth = plant.step(v), plant.backlash
         self._applied.publish(messages.message_with(plant.applied))
         return u, truth.m, truth.c_r, truth.c_l, v, float(sample)
 
     def _publish_output(self, latest_ns: float = inf) -> bool:
-        """Measure y, and publish it unless it is lost on purpose or too late."""
+        """Measure y and publish it unless it is late or lost on purpose; returns whether it was."""
         sample, y, p = self._plant.sample, self._plant.measure(), self.settings
         if sample > 0 and p.output_loss > 0.0 and float(self._loss_rng.random()) < p.output_loss:
             return False

@@ -1,4 +1,4 @@
-"""Node that records all topics of the loop to a bag and tells how the run is going."""
+"""Node that records all topics of the loop to a bag and reports the progress of the run."""
 
 import signal
 import sys
@@ -33,22 +33,22 @@ RECORDER_DEPTH = 10_000  # messages that may wait while the disk is slow
 @dataclass
 class RecordedTopic:
     subscription: Subscription
-    connection: Any = None  # of the bag, if there is one
+    connection: Any = None  # in the bag, if there is one
     newest: bytes = b''  # serialised
     received: int = 0
     missed: int = 0
-    sequence: int = UNNUMBERED  # of the newest message
+    sequence: int = UNNUMBERED  # number of the newest message
 
     def row(self, labels: Sequence[str]) -> dict[str, float]:
-        """The newest message of an array topic by label, without more than the first joint."""
+        """The newest message of an array topic by label, of the first joint only."""
         data = deserialize_message(self.newest, Float64MultiArray).data if self.newest else ()
         return dict(zip(labels, data, strict=False))
 
 
 class RecorderNode(ProcessNode):
-    """Writes messages as they came, stamped with the time (in lockstep simulated) of departure.
+    """Writes messages as they came, stamped with the time of sending (simulated in lockstep).
 
-    Without a bag it tells the progress alone, as where the disk takes no more: failure says why.
+    Without a bag, or after writing has failed, it only reports progress. failure: why it failed.
     """
 
     def __init__(self) -> None:
@@ -62,13 +62,13 @@ class RecorderNode(ProcessNode):
         self.log.info(f'started: records to {p.bag} ({p.storage})' if p.bag else
                       'started: nothing is recorded, as the parameter bag names no folder')
         to = driver_topics(p)
-        # y comes last of all: it starts the loop.
+        # plant_output is subscribed last, in work(): that starts the loop.
         for topic, kind in {
             **dict.fromkeys(topics.LABELS_OF, Float64MultiArray),
             topics.DIAGNOSTICS: DiagnosticArray,
             **{topic: to.types[topic] for topic in (to.reference, to.applied, to.control)},
         }.items():
-            # A G that was learned before this recorder came belongs into the bag as well.
+            # A G that was learned before this recorder started belongs in the bag as well.
             kept = topic == topics.MODEL
             self._record(topic, kind, messages.KEPT_QOS if kept else RECORDER_DEPTH)
         if p.lockstep:
@@ -77,7 +77,7 @@ class RecorderNode(ProcessNode):
 
     def work(self, executor: PromptExecutor) -> None:
         p, to = self.settings, driver_topics(self.settings)
-        # Lockstep promises every row: that of the first truth leaves as soon as y is subscribed to.
+        # Lockstep promises every row: the first truth is sent as soon as y is subscribed to.
         truth = (topics.TRUTH,) if p.lockstep else ()
         wanted = (topics.ESTIMATES, topics.SIGNALS, *truth, to.reference, to.control)
         if self.wait_until(executor, lambda: not p.wait_for_publishers or all(
@@ -86,7 +86,7 @@ class RecorderNode(ProcessNode):
             self._record(to.output, to.types[to.output], output_qos(p, RECORDER_DEPTH))
             emit('ready')
         super().work(executor)
-        # What has arrived belongs into the bag; a signal has to end it within a second.
+        # What has arrived belongs in the bag, but a signal has to end the node within a second.
         deadline = time.monotonic() + 0.3
         while executor.serve_urgent(10_000_000) and time.monotonic() < deadline:
             pass
@@ -115,7 +115,7 @@ class RecorderNode(ProcessNode):
 
     @property
     def _heard(self) -> dict[str, int]:
-        """How many messages of each topic were heard, if any."""
+        """Number of messages heard by topic, of those topics that had any."""
         return {topic: each.received for topic, each in self._channels.items() if each.received}
 
     def _open_bag(self, path: str, storage: str) -> Bag:
@@ -128,16 +128,16 @@ class RecorderNode(ProcessNode):
         diagnostics = messages.DiagnosticsPublisher(self, path)
         well = Finding(Level.OK, 'recording', f'recording to {path}')
         failed = Finding(Level.ERROR, 'stopped', 'recording stopped, all else goes on')
-        # The log has it already.
+        # A failure is in the log already.
         self.every(messages.DIAGNOSTICS_PERIOD_S, lambda: diagnostics.publish(
             failed if self.failure else well, {'reason': self.failure}, logs=False
         ))
-        # A crash or a power cut costs half a second, with the time that a flush takes.
+        # A crash or a power cut costs half a second, including the time of a flush.
         self.every(0.4, lambda: self._with_bag(Bag.flush))
         return bag
 
     def _with_bag(self, action: Callable[[Bag], Any]) -> Any:
-        """Do something with the bag, if there is one; there is none any more where it fails."""
+        """Do something with the bag, if there is one. If that fails, recording stops."""
         if (bag := self._bag) is None:
             return None
         try:
@@ -167,7 +167,7 @@ class RecorderNode(ProcessNode):
         channel = self._channels[topic]
         channel.received += 1
         channel.newest, sequence = message, info['publication_sequence_number']
-        # Each of several publishers has numbers of its own.
+        # /diagnostics has several publishers, each with numbers of its own.
         if UNNUMBERED not in (sequence, channel.sequence) and topic != topics.DIAGNOSTICS:
             channel.missed += max(sequence - channel.sequence - 1, 0)
         channel.sequence = sequence
@@ -179,12 +179,12 @@ class RecorderNode(ProcessNode):
         self._now_ns = time_ns
 
     def _tell(self) -> None:
-        """Say how the run is going, of its first joint if it has several."""
+        """Report the progress of the run, by its first joint if there are several."""
         signals, estimates = (
             self._channels[topic].row(topics.LABELS_OF[topic])
             for topic in (topics.SIGNALS, topics.ESTIMATES)
         )
-        # A joint that was not answered has nan for everything.
+        # The row of a joint without a step is nan.
         samples = [row.get('sample', nan) for row in (signals, estimates)]
         if all(map(isfinite, samples)):
             unheard = samples[0] + 1 - self._channels[topics.SIGNALS].received
@@ -207,7 +207,7 @@ def main(args: list[str] | None = None) -> int:
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         return repair_command(Path(arguments[1]))
     if {'-h', '--help'} & set(arguments):
-        print(f'{RECORDER} --repair BAG: make a bag readable that was never closed, or is damaged')
+        print(f'{RECORDER} --repair BAG: make a bag readable that was never closed or is damaged')
     return run(RECORDER, RecorderNode, args)
 
 

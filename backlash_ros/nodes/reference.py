@@ -20,19 +20,19 @@ from backlash_ros.nodes.runtime.process import ProcessNode, emit, run
 
 
 class ReferenceNode(ProcessNode):
-    """Publishes y_m for the sample that comes next, as ReferencePace says after plant_output.
+    """Publishes y_m for the next sample, after plant_output, when ReferencePace says so.
 
-    A node that waits for its subscribers stays at y_m(0) before the first output. In lockstep y_m
-    leaves once per tick of /clock.
+    If it waits for its subscribers, it stays at y_m(0) until the first output. In lockstep it sends
+    y_m once per tick of /clock.
     """
 
     def __init__(self) -> None:
         super().__init__(REFERENCE_NODE)
         p = self.settings
         self._signal = build_reference(p)
-        self._offset_s = 0.0  # keeps the phase where the frequency changes
+        self._offset_s = 0.0  # keeps the phase when the frequency changes
         self._newest = 0  # sample that was published last
-        self._loop_runs_at = inf  # since then, as the controller tells [s]
+        self._loop_runs_at = inf  # when /diagnostics first said that the loop runs [s]
         self._io = DriverIo(self)
         self._output = self.create_publisher(
             Float64, topics.REFERENCE, messages.KEPT_QOS if p.lockstep else messages.DEPTH
@@ -56,9 +56,9 @@ class ReferenceNode(ProcessNode):
         super().work(executor)
 
     def _follow(self, executor: PromptExecutor) -> None:
-        """Publish y_m half a period after each output, by the own clock where none comes.
+        """Publish y_m half a period after each output, or by the own clock if none comes.
 
-        Woken by each output, the process would take the processor from the controller.
+        Outputs are polled: woken by each, the process would take the processor from the controller.
         """
         p, now = self.settings, time.monotonic()
         counter = SampleCounter(p.sample_period)
@@ -78,13 +78,13 @@ class ReferenceNode(ProcessNode):
         while not self.stopping:
             if pace.waits:
                 serve_polled(diagnostics)
-                # Fast DDS may miss a process of another machine for good that starts at the same
+                # Fast DDS may never discover a process of another machine that starts at the same
                 # moment.
                 if now > self._loop_runs_at + 0.5:
                     pace.waits = False
                     self.log.warning(
                         f'{self._io.topics.output} is not heard here, but by the controller: y_m '
-                        'goes by the own clock; start the driver some seconds before'
+                        'follows the own clock; start the driver some seconds before'
                     )
             if now >= pace.due_s:
                 serve_polled(outputs)
@@ -92,7 +92,7 @@ class ReferenceNode(ProcessNode):
                 sample = pace.sample_to_send(now)
                 if sample is not None:
                     self._publish(sample)
-            # An output that is late is looked for often: y_m leaves as soon as it is there.
+            # A late output is looked for often, so that y_m is sent as soon as it has come.
             wake_at = pace.due_s if now < pace.due_s else now + 0.05 * p.sample_period
             executor.spin_once(timeout_sec=max(wake_at - now, 0.0))
             now = time.monotonic()
@@ -109,7 +109,7 @@ class ReferenceNode(ProcessNode):
         build_reference(p)
 
     def take_up(self, before: Parameters) -> None:
-        """Use another signal from the next sample on; a sine goes on without a jump."""
+        """Use the new signal from the next sample on; a periodic one keeps its phase."""
         self._signal = build_reference(self.settings)
         t, self._offset_s = self._newest * before.sample_period + self._offset_s, 0.0
         if self._signal.waveform in PERIODIC:
@@ -117,7 +117,7 @@ class ReferenceNode(ProcessNode):
             self._offset_s = phase / self._signal.frequency - self._newest * before.sample_period
 
     def _publish(self, sample: int) -> None:
-        # The same product as in a simulation in one process, so that runs agree to the last bit.
+        # Computed as in a simulation in one process, so that runs agree to the last bit.
         self._newest = sample
         y_m = self._signal(sample * self.settings.sample_period + self._offset_s)
         self._output.publish(messages.message_with(y_m))

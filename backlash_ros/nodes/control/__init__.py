@@ -1,1 +1,1 @@
-"""Parts of the controller node: its first and last commands, what it publishes and serves."""
+"""Parts of the controller node: joints and services, published topics, rivals."""

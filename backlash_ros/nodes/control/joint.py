@@ -1,4 +1,4 @@
-"""Joints of the controller: what it says of their loops and their G, and what can be asked."""
+"""Joints of the controller: diagnostics of their loops, the learned G, and services."""
 
 import time
 from array import array
@@ -32,29 +32,29 @@ from backlash_ros.nodes.runtime.process import ProcessNode
 
 
 class Joint:
-    """What the controller has of each joint; a single one is nameless.
+    """What the controller has for each joint; a single one is nameless.
 
-    loop: the newest one, which is not used while the node is unconfigured. told: the state that
-    /diagnostics has. saved_at: when estimates were saved last, on the steady clock [s].
+    loop: the newest one, not in use while the node is unconfigured. told: the state last published
+    to /diagnostics. saved_at: when estimates were last saved, on the steady clock [s].
     """
 
     def __init__(self, node: ProcessNode, name: str, io: DriverIo, loop: ControlLoop) -> None:
         self.name, self.loop = name, loop
         self._node, self._io = node, io
-        # Who comes late gets the newest ones: G may never change again. More than one, so that a
-        # subscriber that is held up misses none, and one of each joint.
+        # Late subscribers get the newest messages, as G may never change again: several, for one of
+        # each joint, and so that a subscriber that is held up misses none.
         newest = QoSProfile(depth=20, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._model = node.create_publisher(
             Float64MultiArray, topics.of_node(topics.MODEL), newest, event_callbacks=NO_EVENTS
         )
-        # The newest one that followed a sample, and the number of that.
+        # The last model published after a sample, and the index of that sample.
         self._told_model: tuple[StateModel | None, float] = None, -inf
         self.told: object = None
         self._lately = Lately()
         self._diagnostics = DiagnosticsPublisher(
             node, node.settings.of_joint(name).io.joint or io.publisher.topic_name, part=name
         )
-        # A disk that is slow to confirm a file would cost samples; one writing follows the other.
+        # In a thread, as a slow disk would cost samples; files are written one after the other.
         self._writer = futures.ThreadPoolExecutor(1, thread_name_prefix='estimates')
         self.saved_at = time.monotonic()
 
@@ -67,7 +67,7 @@ class Joint:
         return self.loop.phase, self.loop.estimate.status
 
     def check_change(self, p: Parameters) -> None:
-        """Raise ParameterError for values that cannot be taken up."""
+        """Raise ParameterError for values that cannot be used now."""
         build_controller(p, first_guess(p))
         if self._node.configured and p[NOISE] != self.p[NOISE] \
                 and NOISE not in self.loop.core.estimator.RETUNED:
@@ -77,19 +77,19 @@ class Joint:
             )
 
     def follow_model(self) -> None:
-        """Publish ~/model when G has changed, else once per second of samples.
+        """Publish ~/model if G has changed, or if a second's worth of samples has passed.
 
-        These are counted, so that a run in lockstep is the same whenever it is made.
+        Samples are counted instead of time, so that runs in lockstep are repeatable.
         """
         learned, index = self.loop.core.estimator.learned_model, self.loop.counter.index
         told, told_index = self._told_model
-        # Deviations and noise change with every few samples, and are of use to a reader.
+        # Standard deviations and noise change every few samples, and are of use as well.
         if learned is not told or (index - told_index) * self.p.sample_period >= 1.0:
             self._told_model = learned, index
             self.publish_model()
 
     def publish_model(self, wait_s: int = 0) -> None:
-        """Publish ~/model at once. wait_s: how long at most until who listens has it."""
+        """Publish ~/model now. wait_s: how long to wait for subscribers to confirm it, at most."""
         fields = learned_model_of(self.loop.core.estimator, self.p)
         message = Float64MultiArray(data=array('d', chain(*fields.values())))
         message.layout.dim = [
@@ -101,7 +101,7 @@ class Joint:
             self._model.wait_for_all_acked(Duration(seconds=wait_s))
 
     def save(self) -> futures.Future[str] | None:
-        """Begin to save the estimates, if worth it; the result says why it failed, if it did."""
+        """Start saving the estimates, if worthwhile; the result is '' or why it has failed."""
         p, estimate = self.p, self.loop.estimate
         if not p.estimates.file or not worth_saving(estimate):
             return None
@@ -122,7 +122,7 @@ class Joint:
         self, around: diagnosis.Neighbours, timing: Timing, claim: Mapping[str, object],
         active: bool,
     ) -> None:
-        """Publish what is going on to /diagnostics. claim: what the node says in each of them."""
+        """Publish the state of the joint to /diagnostics. claim: entries that identify the node."""
         loop, p, io, publish = self.loop, self.p, self._io, self._diagnostics.publish
         level, finding_of = diagnosis.Level, diagnosis.Finding
         if not self._node.configured:
@@ -141,7 +141,7 @@ class Joint:
             text = f'{io.topics.output} has no {p.io.field} of joint {p.io.joint!r} but ' \
                 f'{io.seen}: set io.joint, io.field'
             findings.insert(0, finding_of(level.ERROR, 'joint', text[:diagnosis.LONGEST_TEXT]))
-        # The likeliest cause at the highest level that was found.
+        # The likeliest cause, with the highest level of all findings.
         worst = max(findings, key=lambda finding: finding.level > level.OK)
         worst = worst._replace(level=max(finding.level for finding in findings))
         details = {f'finding {i}': finding.text for i, finding in enumerate(findings, start=1)}
@@ -152,7 +152,7 @@ class Joint:
             ) or 'nobody'
         if around.rivals:
             details[f'{around.control.name} also published by'] = ', '.join(around.rivals)
-        # What is true of all joints the first one says in the log.
+        # Findings that all joints share are logged by the first one alone.
         first = self._node.settings.joint_names[0]
         logs = self.name == first or worst.kind not in diagnosis.OF_MESSAGES
         publish(worst, {**details, **values}, logs)
@@ -196,7 +196,7 @@ def values_of(loop: ControlLoop, timing: Timing) -> dict[str, object]:
         **dict(zip(('std_m', 'std_c_r', 'std_c_l'), stated_deviations(e), strict=True)),
         'learning': law.adapting, 'compensating': loop.core.compensating,
         'using applied_control': loop.commands.trust.trusted,
-        # Above 1 the gap is crossed, without which nothing can be learned of it.
+        # The gap is crossed, and can be learned, only above 1.
         'excitation: swing of v / gap': swing / gap if gap > 0.0 else swing,
         'rate [Hz]': 0.0 if isnan(mean_s) or mean_s <= 0.0 else 1.0 / mean_s,
         'latency p50 [ms]': p50_ms, 'latency p99 [ms]': p99_ms,
@@ -211,7 +211,7 @@ def offer_services(node: ProcessNode, joints: Sequence[Joint]) -> None:
         kind: type[SetBool] | type[Trigger], name: str,
         act: Callable[[ControlLoop, bool], None], done: tuple[str, str],
     ) -> None:
-        """Act upon all loops; the bool, and which text it is done with, is what was asked for."""
+        """Create a service that acts on all loops. done: answers to a request for False, True."""
         def serve(request: Any, response: Any) -> Any:
             wanted = getattr(request, 'data', True)
             if node.configured:
@@ -235,7 +235,7 @@ def offer_services(node: ProcessNode, joints: Sequence[Joint]) -> None:
             response.message = 'nothing was learned yet'
         else:
             for writing in writings:
-                # The loop goes on while the disk takes its time.
+                # The loop goes on while the file is written.
                 written: Future = Future()
                 writing.add_done_callback(written.set_result)
                 await written
@@ -250,7 +250,7 @@ def offer_services(node: ProcessNode, joints: Sequence[Joint]) -> None:
           ('the gap is not compensated', 'the gap is compensated'))
     offer(Trigger, '~/reset_estimates', lambda loop, _: loop.reset(),
           ('', 'the estimates are those of estimator.initial'))
-    # In a group of its own, so that it does not keep the others waiting.
+    # In a group of its own, so that it does not hold up the other services.
     node.create_service(
         Trigger, '~/save_estimates', cast(Callable[..., Trigger.Response], save),
         callback_group=MutuallyExclusiveCallbackGroup(),

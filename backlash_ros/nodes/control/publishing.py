@@ -1,4 +1,4 @@
-"""What the controller publishes of every step besides its commands, as rows and one by one."""
+"""What the controller publishes for each step besides its commands, as rows and as numbers."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -18,12 +18,12 @@ from backlash_ros.nodes.runtime.messages import NO_EVENTS, LabelledArrayPublishe
 class StepPublisher:
     """The topics ~/signals, ~/estimates and those below ~/watch, one for each label.
 
-    The rows of several joints stand one after the other; that of a joint without a step is nan.
-    Below ~/watch comes after v(k) the u that it led to, known with y(k+1): points of their loop.
-    heard: whether anybody listened at the newest look: nothing is made for nobody.
+    A message has the rows of all joints in turn, nan for a joint without a step. Below ~/watch,
+    v(k) is followed by the u that it caused, known with y(k+1), so that both plot as a hysteresis.
+    heard: whether anybody listened at the last look; if not, nothing is published.
     """
 
-    WATCH_PAUSE_S = 0.04  # after messages below ~/watch; a loop at 1 kHz has no time for many more
+    WATCH_PAUSE_S = 0.04  # between messages below ~/watch; a loop at 1 kHz has no time for more
 
     def __init__(self, node: Node, joints: Sequence[str]) -> None:
         self._arrays = {
@@ -47,7 +47,7 @@ class StepPublisher:
         return min(publisher.listeners for publisher in self._arrays.values())
 
     def look(self) -> None:
-        """Look who listens; to ask at every sample would take a tenth of it."""
+        """See which topics have subscribers: to ask in every sample would take a tenth of it."""
         joint = next(self._turns)
         self._watched[joint] = [label for label, publisher in self._watch[joint].items()
                                 if publisher.get_subscription_count()]
@@ -74,7 +74,7 @@ class StepPublisher:
 
 
 def labelled(loop: ControlLoop, step: ControlStep) -> dict[str, float]:
-    """What SIGNAL_LABELS, ESTIMATE_LABELS and WATCH_LABELS name, of the newest sample."""
+    """Values for SIGNAL_LABELS, ESTIMATE_LABELS and WATCH_LABELS at the newest sample."""
     e, law = step.estimate, loop.core.estimator
     values = {
         'y_m': step.y_m, 'y': step.y, 'u_d': step.u_d, 'v': step.v, 'u_hat': law.u_hat,

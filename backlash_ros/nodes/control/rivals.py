@@ -1,4 +1,4 @@
-"""Who else commands the same actuator, and which of them has to stand down."""
+"""Find other publishers of the command, and decide which of them has to stand down."""
 
 import errno
 import hashlib
@@ -17,30 +17,30 @@ from backlash_ros.nodes.runtime.process import ProcessNode
 
 # Keys in /diagnostics by which controllers know each other.
 ENDPOINT, SINCE = 'endpoint of control', 'active since [ns]'
-WAITS_NS = 2**63 - 1  # in place of that time: is active after all others
+WAITS_NS = 2**63 - 1  # instead of that time: waits for the lock, behind all others
 
 
 class CommandLock:
-    """One process of a machine at most may command a topic, whatever discovery knows so far.
+    """Lets only one process of a machine command a topic, before discovery knows of the others.
 
-    It is a name in the abstract namespace of Unix sockets (Linux), made of domain and topic. The
-    kernel takes it back with the process that has it, however that ends.
+    The lock is a name in the abstract namespace of Unix sockets (Linux), made of domain and topic.
+    The kernel releases it when its process ends, however that ends.
     """
 
     def __init__(self, domain: int, topic: str) -> None:
-        # A name may have 107 bytes, a topic more.
+        # A name may have 107 bytes, and a topic may be longer.
         place = hashlib.sha256(f'{domain} {topic}'.encode()).hexdigest()
         self._name = f'\0backlash_ros/{place}'
         self._socket: socket.socket | None = None
 
     def take(self) -> bool:
-        """Take it if it is free; returns whether this process has it."""
+        """Take the lock if it is free; returns whether this process has it."""
         if self._socket is None:
             self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
             try:
                 self._socket.bind(self._name)
             except OSError as error:
-                # Where sockets are forbidden everybody has it.
+                # If sockets are forbidden, every process has it.
                 if error.errno == errno.EADDRINUSE:
                     self.release()
         return self._socket is not None
@@ -59,18 +59,18 @@ class Rival(NamedTuple):
 
 
 class Rivals:
-    """Tells who of several publishers was first, by the time and identity in /diagnostics.
+    """Tells which of several publishers was first, by their times and identities in /diagnostics.
 
-    Whoever says nothing of the kind was first if it was there when this controller became active.
-    A controller that is not active, or has fallen silent, is no rival. since_ns: 0 while inactive.
-    settled_at: when all are found that were there already, on the steady clock [s].
+    A publisher without such entries was first if it was there when this controller became active.
+    A controller that is inactive or silent is no rival. since_ns: since when this one is active, 0
+    if it is not. settled_at: when discovery knows all that were there before, steady clock [s].
     """
 
     def __init__(self, own: str, settled_at: float) -> None:
         self.own, self.settled_at = own, settled_at
         self.since_ns, self._active_at = 0, 0.0
-        # By identity: since when it is active [ns], 0 if it is not, and when it has said so; None,
-        # and when it was found, of whoever says nothing.
+        # By identity: since when it is active [ns], 0 if it is not, and when it said so; or None
+        # and when it was found, if it says nothing.
         self._known: dict[str, tuple[int | None, float]] = {}
 
     def begin(self, since_ns: int, now: float) -> None:
@@ -82,7 +82,7 @@ class Rivals:
             self._known[identity] = int(since), now
 
     def among(self, others: Mapping[str, str], now: float) -> tuple[Rival, ...]:
-        """The rivals among the other publishers, given by identity with their names."""
+        """The rivals among the other publishers, which are given as names by identity."""
         self._known = {each: self._known.get(each, (None, now)) for each in others}
         found = []
         for each, name in others.items() if self.since_ns else ():
@@ -95,21 +95,21 @@ class Rivals:
 
 
 class RivalWatch(Rivals):
-    """Looks out for other publishers of the command while the node runs.
+    """Watches for other publishers of the command while the node runs.
 
-    Of the controllers of one machine the one with the lock commands, as far as those of others let
-    it. changed: called when there is something new to say. found: the rivals at the newest look.
+    On each machine only the controller with the lock competes with those of other machines.
+    changed: called when there is news to publish. found: the rivals at the last look.
     """
 
     def __init__(self, node: ProcessNode, io: DriverIo, changed: Callable[[], None]) -> None:
         self.topic = node.resolve_topic_name(io.topics.control)
         self._node, self._changed = node, changed
-        # What discovery mostly takes: a publisher that is found so soon was there before.
+        # Discovery rarely takes longer: a publisher that is found by then was there before.
         super().__init__(self._identity_after(io.advertise), time.monotonic() + 0.7)
         self.found: tuple[Rival, ...] = ()
         self._lock = CommandLock(node.context.get_domain_id(), self.topic)
-        self._told: tuple[tuple[Rival, ...], bool] = (), False  # at the look before
-        self._hello_until = -inf  # until then others are told at every look who was first
+        self._told: tuple[tuple[Rival, ...], bool] = (), False  # at the last look
+        self._hello_until = -inf  # until then, others are told at every look who was first
         self._diagnostics = node.listen_to_diagnostics(
             lambda _, values, received_ns: self.hear(values, 1e-9 * arrival_ns(received_ns))
         )
@@ -117,7 +117,7 @@ class RivalWatch(Rivals):
 
     @property
     def any_first(self) -> bool:
-        """Whether somebody else is in charge of the actuator."""
+        """Whether another publisher is in charge of the actuator."""
         return self.since_ns == WAITS_NS or any(rival.was_first for rival in self.found)
 
     @property
@@ -125,7 +125,7 @@ class RivalWatch(Rivals):
         return {ENDPOINT: self.own, SINCE: self.since_ns}
 
     def follow(self, active: bool) -> None:
-        """Take note of whether the controller is active."""
+        """Compete for the actuator while the controller is active."""
         if not active:
             self._lock.release()
         self.begin(WAITS_NS if active else 0, time.monotonic())
@@ -135,7 +135,7 @@ class RivalWatch(Rivals):
         now, node = time.monotonic(), self._node
         if self.since_ns == WAITS_NS and self._lock.take():
             self.begin(time.time_ns(), now)
-        # Counting is ten times cheaper than asking who they are.
+        # To count publishers is ten times cheaper than to ask for their names.
         infos = node.get_publishers_info_by_topic(self.topic) \
             if node.count_publishers(self.topic) > 1 else []
         others = {identity_of(info): name_of(info) for info in infos}
@@ -152,12 +152,12 @@ class RivalWatch(Rivals):
             self._changed()
 
     def _identity_after(self, advertise: Callable[[], object]) -> str:
-        """The identity of the publisher that advertise makes; rclpy has no way to ask for it."""
+        """The identity of the publisher that `advertise` makes, which rclpy does not tell."""
         node, own_name = self._node, self._node.get_fully_qualified_name()
         before = {identity_of(info) for info in node.get_publishers_info_by_topic(self.topic)}
         advertise()
         for _ in range(10_000):
-            # A namesake that is discovered at this very moment has no name yet.
+            # A namesake that is discovered at this moment has no name yet.
             for info in node.get_publishers_info_by_topic(self.topic):
                 if identity_of(info) not in before and name_of(info) == own_name:
                     return identity_of(info)
@@ -166,5 +166,5 @@ class RivalWatch(Rivals):
 
 
 def identity_of(info: TopicEndpointInfo) -> str:
-    """Identity of an endpoint, one and the same for all who see it."""
+    """Identity of an endpoint, the same in every process."""
     return bytes(info.endpoint_gid).hex()

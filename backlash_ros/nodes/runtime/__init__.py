@@ -1,1 +1,1 @@
-"""A node as a process: arguments, parameters, executor, life, signals, end."""
+"""Run a node as a process: arguments, parameters, executor, messages, signals, shutdown."""

@@ -1,4 +1,4 @@
-"""What the driver says and is told, by joint, in the messages that io.style names."""
+"""Messages from and to the driver, by joint, of the types that io.style names."""
 
 import time
 from array import array
@@ -27,7 +27,7 @@ from backlash_ros.nodes.runtime.process import ProcessNode
 
 
 class DriverTopics(NamedTuple):
-    """Where y_m and y come from, v goes to, and the driver reports it; types: of their messages."""
+    """Topics of y_m, of y, of v, and of the v that the driver reports. types: message by topic."""
 
     reference: str
     output: str
@@ -53,7 +53,7 @@ def driver_topics(p: Parameters) -> DriverTopics:
 
 
 def check_style(p: Parameters) -> None:
-    """Raise ParameterError where the messages of io.style cannot carry what is asked for."""
+    """Raise ParameterError if the messages of io.style cannot carry what is asked for."""
     style = p.io.style
     if p.lockstep and style != 'native':
         raise ParameterError('lockstep', True, 'needs io.style: native')
@@ -73,11 +73,11 @@ def output_qos(p: Parameters, depth: int) -> QoSProfile:
 
 
 class DriverIo:
-    """What a node says to the driver and hears from it, by joint.
+    """Publishes to the driver and subscribes to it, by joint.
 
     The only joint of a controller without `joints` is nameless; io.joint is its name in messages.
-    skipped: messages in a row without a joint. seen: the joints of the newest of these.
-    heard: subscriptions by topic.
+    skipped: by joint, the number of messages in a row without it. seen: the joints in the newest of
+    these. heard: subscriptions by topic.
     """
 
     publisher: Publisher
@@ -88,25 +88,25 @@ class DriverIo:
         self._names = {joint: joint or p.io.joint for joint in p.joint_names}  # in messages
         self.skipped, self.seen = dict.fromkeys(p.joint_names, 0), ''
         self._node = node
-        self._stamp = 0, 0  # in the header of the newest y, and the number of its message
+        self._stamp = 0, 0  # in the header of the newest y, and the number of that message
         self.clock = WallClock()
-        self._repeats_stamps = False  # since then the time of sending counts
+        self._repeats_stamps = False  # if headers do, the time of sending is used
         self._newest: dict[str, float] = {}  # v by joint
         self._referred = JointMessage()  # the newest message of references
         self.heard: dict[str, Subscription] = {}
 
     @cached_property
     def simulated_time(self) -> bool:
-        """Whether stamps are those of /clock: the middleware has real time."""
+        """Whether stamps are of /clock, while those of the middleware are real time."""
         return bool(self._node.get_parameter('use_sim_time').value)
 
     @property
     def is_simulated(self) -> bool:
-        """Whether y comes from the plant of this package: no other one tells the truth."""
+        """Whether y comes from the plant of this package, the only one with the topic TRUTH."""
         return self._node.count_publishers(topics.TRUTH) > 0
 
     def driver_of(self, joint: str) -> Driver:
-        """What a loop can ask about its driver; the simulated plant has nothing to be asked."""
+        """What a loop can ask about its driver; of the simulated plant nothing is asked."""
         @cache
         def warn_once(text: str) -> None:
             if not self.is_simulated:
@@ -119,24 +119,24 @@ class DriverIo:
                       wall_ns=lambda: time.time_ns() - self.clock.set_ns)
 
     def now_ns(self) -> int:
-        # time.time_ns() is the system clock of ROS, without the detour.
+        # time.time_ns() is the system clock of ROS, but faster.
         return self._node.get_clock().now().nanoseconds if self.simulated_time \
             else time.time_ns() - self.clock.set_ns
 
     def stamp_ns(self, info: dict[str, Any]) -> int:
-        """When a message left."""
+        """When a message was sent."""
         return self.now_ns() if self.simulated_time \
             else int(info['source_timestamp']) - self.clock.of_stamps_ns
 
     def known_of(self, timing: Timing) -> Timing:
-        # Those of simulated time have nothing to do with the time of arrival.
+        # Simulated stamps cannot be compared with the time of arrival.
         age_s = nan if self.simulated_time else timing.age_s
         return timing._replace(age_s=age_s, repeats_stamps=self._repeats_stamps)
 
     def listen(
         self, hear: Callable[[Mapping[str, Output]], None], depth: int, polled: bool = False,
     ) -> Subscription:
-        """Call hear with every y. polled: when serve_polled is called."""
+        """Call hear with every y, by joint. polled: only in serve_polled."""
         numbered = self.topics.types[self.topics.output] is Float64
 
         def hear_output(
@@ -154,12 +154,12 @@ class DriverIo:
                     return
                 before, self._stamp = self._stamp, (message.stamp_ns, number)
                 if message.stamp_ns and self._stamp == (before[0], before[1] + 1):
-                    # Two publishers with the same stamps are told apart by their numbers, mostly.
+                    # Two publishers may send the same stamps; mostly their numbers differ.
                     self._repeats_stamps = self._repeats_stamps \
                         or self._node.count_publishers(self.topics.output) == 1
                 stamp_ns = 0 if self._repeats_stamps else message.stamp_ns
             if not self.simulated_time:
-                # Drivers that leave the header empty are known by the stamp of the middleware.
+                # If the driver leaves the header empty, the stamp of the middleware is used.
                 stamp_ns = stamp_ns or source_ns
                 self.clock.look_now(stamp_ns)
             of_stamps_ns = self.clock.of_stamps_ns
@@ -175,7 +175,7 @@ class DriverIo:
         self, topic: str, hear: Callable[[dict[str, float], dict[str, Any], Any], None],
         qos: QoSProfile | int, polled: bool = True,
     ) -> Subscription:
-        """Call hear with values by joint, info, and content. polled: in serve_waiting."""
+        """Call hear with values by joint, info, and content. polled: only when it is served."""
         kind = self.topics.types[topic]
         readers: dict[type[Any], Callable[[bytes], Any]] = {
             Float64: messages.numbers_of, JointState: messages.JointReader().read,
@@ -193,12 +193,12 @@ class DriverIo:
         return self.heard[topic]
 
     def serve_waiting(self) -> None:
-        """Hear the references and reports that have come; not in lockstep, where nothing waits."""
+        """Take the waiting references and reports; not in lockstep, where neither is polled."""
         for topic in (self.topics.reference, self.topics.applied):
             serve_polled(self.heard[topic])
 
     def values(self, message: Sequence[float] | JointMessage) -> dict[str, float]:
-        """What a message says about the joints of this node, by their names."""
+        """The values in a message for the joints of this node, by their names."""
         names = self._names
         if not isinstance(message, JointMessage):
             values = message
@@ -215,7 +215,7 @@ class DriverIo:
         self.publisher = self._node.create_publisher(self.topics.types[topic], topic, DEPTH)
 
     def publish(self, commands: Mapping[str, float]) -> None:
-        """Send v, by joint, to the driver; an array as soon as there is a v of every joint."""
+        """Send v, by joint, to the driver; an array is sent once every joint has had a v."""
         kind = self.topics.types[self.topics.control]
         if kind is Float64MultiArray:
             self._newest.update(commands)
@@ -223,13 +223,13 @@ class DriverIo:
                 data = array('d', map(self._newest.__getitem__, self._names))
                 self.publisher.publish(Float64MultiArray(data=data))
             return
-        # What rclpy would do after it has found out that these are bytes.
+        # As rclpy does once it has found out that these are bytes.
         self.publisher.handle.publish_raw(
             messages.message_with(commands['']) if kind is Float64
             else messages.joint_message(self._joint_state(commands)))
 
     def _joint_state(self, commands: Mapping[str, float]) -> JointMessage:
-        """v, and what the newest reference says of the joints besides."""
+        """v, and the other fields of the joints as in the newest reference."""
         names = tuple(map(self._names.__getitem__, commands))
         row, fields = {name: i for i, name in enumerate(self._referred.name)}, {}
         for field in ('position', 'velocity', 'effort'):
@@ -241,13 +241,13 @@ class DriverIo:
         return JointMessage(self.now_ns(), names, **fields)
 
     def neighbours(self, rivals: tuple[str, ...]) -> diagnosis.Neighbours:
-        """Who is on the topics of the controller. rivals: who else publishes v."""
+        """Who is on the topics of the controller. rivals: other publishers of v."""
         node, (y_m, y, v, _, types) = self._node, self.topics
         publishers, own_name = node.get_publishers_info_by_topic, node.get_fully_qualified_name()
-        # As the middleware has it: rclpy keeps what was asked for, with zeros for "no limit".
+        # The QoS as the middleware has it: rclpy keeps what was asked for, with 0 for no limit.
         own = [info for info in publishers(v) if name_of(info) == own_name][:1]
         references, outputs = self.heard[y_m].qos_profile, output_qos(self._node.settings, DEPTH)
-        # Of each who is there: what is offered and what is wanted.
+        # By topic: each endpoint with the QoS that is offered and that is wanted.
         there = {
             y: [(info, info.qos_profile, outputs) for info in publishers(y)],
             y_m: [(info, info.qos_profile, references) for info in publishers(y_m)],
@@ -264,7 +264,7 @@ class DriverIo:
 
 
 def _misfit(sent: str, kind: type[Any], offers: QoSProfile, wants: QoSProfile) -> str:
-    """Why no message passes, as diagnosis.Peer says it."""
+    """Why no message passes, in the words of diagnosis.Peer, or ''."""
     if sent != messages.name_of_type(kind):
         return 'type'
     if qos_check_compatible(offers, wants)[0] != QoSCompatibility.ERROR:

@@ -1,6 +1,6 @@
-"""An executor for nodes whose messages come up to a thousand times a second.
+"""An executor for nodes with up to a thousand messages per second.
 
-All that looks inside of rclpy, of the version of ROS 2 Jazzy, is in this file.
+All uses of internals of rclpy, in its version for ROS 2 Jazzy, are in this file.
 """
 
 import time
@@ -19,13 +19,13 @@ WITH_INFO = Subscription.CallbackType.WithMessageInfo
 
 
 class Polled(MutuallyExclusiveCallbackGroup):
-    """Of subscriptions whose messages wait for serve_polled: a tenth of the cost of a wake-up."""
+    """Group of subscriptions whose messages wait for serve_polled, at a tenth of the cost."""
 
 
 def serve_polled(subscription: Subscription) -> None:
-    """Call the callback of a polled subscription with all that has come, oldest first."""
+    """Call the callback of a polled subscription with each waiting message, oldest first."""
     take, callback = subscription.handle.take_message, subscription.callback
-    # Where only the newest is kept, there is no second one.
+    # At most as many as the queue holds.
     left = subscription.qos_profile.depth
     while left and (taken := take(subscription.msg_type, subscription.raw)) is not None:
         callback(*taken)
@@ -33,7 +33,7 @@ def serve_polled(subscription: Subscription) -> None:
 
 
 def refuse_unfit_transitions(node: Node) -> None:
-    """Answer a transition that the present state does not have, instead of ending of it."""
+    """Refuse a lifecycle transition that the present state does not have, instead of crashing."""
     service = next(s for s in node.services if s.srv_type is ChangeState)
     change = cast(Callable[..., Any], service.callback)
 
@@ -49,11 +49,11 @@ def refuse_unfit_transitions(node: Node) -> None:
 
 
 class PromptExecutor(SingleThreadedExecutor):
-    """Serves the subscriptions of one node at once, all else after them; no timer is cancelled.
+    """Serves the subscriptions of one node first, then all else; it expects no cancelled timers.
 
-    The executor of rclpy makes a new wait set of everything for each message, which takes longer
-    than to answer it. This one keeps one of the urgent, calls timers when they are due, and five
-    times a second leaves the rest to rclpy. It wakes up as often, for signals.
+    The executor of rclpy builds a wait set of all entities for each message, which takes longer
+    than to answer it. This one keeps a wait set of subscriptions, calls timers when they are due,
+    and leaves the rest to rclpy five times a second. It wakes up as often, for signals.
     """
 
     def __init__(self, node: Node) -> None:
@@ -61,8 +61,8 @@ class PromptExecutor(SingleThreadedExecutor):
         self.add_node(node)
         self._node = node
         self._subscriptions: list[Subscription] = []  # of the wait set, and the polled ones
-        # Of each subscription what is needed between the arrival of a message and its callback:
-        # after a pause every attribute of rclpy that is looked up there costs microseconds.
+        # For each subscription, all that is needed from the arrival of a message to its callback:
+        # after a pause, to look up an attribute of rclpy costs microseconds.
         self._served: list[tuple[Any, ...]] = []
         self._wait_set: Any = None
         self._look_at_ns = self._rclpy_at_ns = 0  # when timers are due, and all else
@@ -75,15 +75,15 @@ class PromptExecutor(SingleThreadedExecutor):
         return bool(super().shutdown(timeout_sec))
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
-        """Serve one message of each topic and what else is due; wait for the next look at most."""
+        """Serve one message of each topic and whatever is due, after waiting until that at most."""
         wait_ns = self._look_at_ns - time.monotonic_ns()
         if timeout_sec is not None:
             wait_ns = min(wait_ns, int(timeout_sec * 1e9))
-        # What is due so soon after a message is done now: later it might hold up the next one.
+        # After a message, what is soon due is done now: later it might delay the next message.
         self.look_if_due(ahead_ns=5_000_000 if self.serve_urgent(max(wait_ns, 0)) else 0)
 
     def serve_urgent(self, wait_ns: int) -> bool:
-        """Serve one message of each topic, after at most this wait; returns whether any came."""
+        """Wait for messages at most that long and serve one of each topic; returns if any came."""
         subscriptions = list(self._node.subscriptions)
         if subscriptions != self._subscriptions or self._wait_set is None:
             self._subscriptions = subscriptions
@@ -109,8 +109,8 @@ class PromptExecutor(SingleThreadedExecutor):
         return bool(ready)
 
     def look_if_due(self, ahead_ns: int = 0) -> None:
-        """Serve what is not urgent, if it is due within so long."""
-        look_ns = 200_000_000  # services and signals may wait so long
+        """Serve timers and whatever else is not urgent, if it is due within ahead_ns."""
+        look_ns = 200_000_000  # longest wait of services and signals
         now = time.monotonic_ns()
         if now + ahead_ns < self._look_at_ns:
             return
@@ -119,7 +119,7 @@ class PromptExecutor(SingleThreadedExecutor):
                 timer.handle.call_timer()
                 timer.callback()
                 if time.monotonic_ns() > now + 1_000_000:
-                    return  # a message may wait: what else is due comes after it
+                    return  # a message may wait, and comes before all else that is due
         if now + ahead_ns >= self._rclpy_at_ns:
             self._rclpy_at_ns = now + (0 if self._serve_rest() else look_ns)
         wait_ns = min((timer.time_until_next_call() for timer in self._node.timers),
@@ -133,7 +133,7 @@ class PromptExecutor(SingleThreadedExecutor):
             except TimeoutException:
                 return False
             handler()
-            # What waits for something, as a service for the disk, is looked at again next time.
+            # A coroutine that waits, as a service for the disk, is resumed another time.
             if handler.done():
                 handler.result()  # raises what the callback has raised
                 return True

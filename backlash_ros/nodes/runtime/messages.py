@@ -1,8 +1,8 @@
-"""Messages that are made once and published often, and those of every sample as bytes.
+"""Publish arrays and diagnostics, and convert the messages of every sample from and to bytes.
 
-rclpy takes and publishes these in half the time of a std_msgs/Float64, in a tenth of that of a
-sensor_msgs/JointState of six joints. Four bytes name the encoding, the second one odd where the
-lowest byte comes first. What follows is aligned to its size (CDR: DDS Interoperability, 10.2).
+rclpy takes and publishes bytes in half the time of a std_msgs/Float64, and in a tenth of that of a
+sensor_msgs/JointState of six joints. Four bytes name the encoding: the second is odd for
+little-endian. The rest is aligned to its size (CDR: DDS Interoperability, 10.2).
 """
 
 import time
@@ -26,21 +26,21 @@ from backlash_ros import topics
 from backlash_ros.core.loop.diagnosis import UNNAMED, Finding, Level, LevelLog
 from backlash_ros.nodes.runtime.process import emit
 
-# Deep enough that a recorder which is held up for a second misses nothing.
+# Deep enough that a subscriber that is held up for a second misses nothing.
 DEPTH = 1000
 DIAGNOSTICS_PERIOD_S = 1.0  # of every node, besides each change
-SILENT_S = 3.0 * DIAGNOSTICS_PERIOD_S  # after which a node that has said something is gone
-# In lockstep a missed message would stop the loop for good: who comes late gets it all the same.
+SILENT_S = 3.0 * DIAGNOSTICS_PERIOD_S  # silence after which a node counts as gone
+# In lockstep a missed message would stop the loop for good, so late subscribers get it as well.
 KEPT_QOS = QoSProfile(depth=DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-# For publishers that the loop does not depend on, nobody is told of unfit subscribers: at every
-# look at what is not urgent the executor goes through every event of every publisher.
+# Publishers that the loop does not need report no incompatible subscribers: rclpy would check every
+# event of every publisher whenever it serves the rest.
 NO_EVENTS = PublisherEventCallbacks(use_default_callbacks=False)
 CDR_FLOAT64 = Struct('<xBxxd')
 LITTLE_ENDIAN = b'\x00\x01\x00\x00'
 
 
 class LabelledArrayPublisher:
-    """Publishes rows of numbers whose labels stand in layout.dim."""
+    """Publishes rows of numbers, with their labels in layout.dim."""
 
     def __init__(self, node: Node, topic: str, labels: Sequence[str]) -> None:
         self._publisher = node.create_publisher(
@@ -55,13 +55,13 @@ class LabelledArrayPublisher:
 
     def publish(self, row: Sequence[float]) -> None:
         if self.listeners:
-            # An array is taken as it is; a list would be checked element by element.
+            # rclpy takes an array as it is, but checks each element of a list.
             self._message.data = array('d', row)
             self._publisher.publish(self._message)
 
 
 class DiagnosticsPublisher:
-    """Publishes the state of a node, or a part of it, to /diagnostics, and changes to the log."""
+    """Publishes the state of a node, or of a part of it, to /diagnostics, and logs its changes."""
 
     def __init__(self, node: Node, hardware_id: str, part: str = '') -> None:
         self._node, self._part = node, part
@@ -73,7 +73,7 @@ class DiagnosticsPublisher:
         self._log = LevelLog(self._write)
 
     def publish(self, finding: Finding, values: Mapping[str, object], logs: bool = True) -> None:
-        """values: details to it. logs: False for what another part of the node says in the log."""
+        """Publish a finding with values as details. logs: False if another part logs it."""
         self._status.level, self._status.message = bytes([finding.level]), finding.text
         self._status.values = [
             KeyValue(key=key, value=f'{value:.6g}' if isinstance(value, float) else str(value))
@@ -87,7 +87,7 @@ class DiagnosticsPublisher:
 
     def _write(self, level: Level, text: str) -> None:
         log, line = Node.get_logger(self._node), line_of(self._part, text)
-        # rclpy remembers a severity for each place in the code.
+        # rclpy allows only one severity for each line of code.
         if level == Level.OK:
             log.info(line)
         elif level == Level.WARN:
@@ -98,41 +98,41 @@ class DiagnosticsPublisher:
 
 
 def line_of(joint: str, text: str) -> str:
-    """A line of the log about a joint; the only one is nameless."""
+    """A line of the log about a joint, which is nameless if it is the only one."""
     return f'{joint}: {text}' if joint else text
 
 
 def name_of(info: TopicEndpointInfo) -> str:
     """Full name of the node that has an endpoint."""
-    # Names are discovered a little later than topics, and programs without ROS have none.
+    # Names are discovered later than topics, and programs without ROS have none.
     if not info.node_name or 'UNKNOWN' in info.node_name:
         return UNNAMED
     return f'{info.node_namespace.rstrip("/")}/{info.node_name}'
 
 
 def name_of_type(message_type: type[Any]) -> str:
-    """As discovery and bags have it, std_msgs/msg/Float64."""
+    """Name of a type as in discovery and bags: std_msgs/msg/Float64."""
     return f'{message_type.__module__.split(".")[0]}/msg/{message_type.__name__}'
 
 
 def arrival_ns(received_ns: int) -> int:
-    """When a message arrived, on the monotonic clock, from what the middleware says of it."""
-    # A clock that was set back since must not put it into the future.
+    """Convert the middleware's time of arrival of a message to the monotonic clock."""
+    # If the clock was set back since, the arrival must not lie in the future.
     return time.monotonic_ns() - max(time.time_ns() - received_ns, 0)
 
 
 def numbers_of(message: bytes) -> tuple[float, ...]:
-    """The only number that a std_msgs/Float64 holds."""
+    """The number in a std_msgs/Float64, as a tuple of one."""
     return (CDR_FLOAT64 if message[1] & 1 else Struct('>xBxxd')).unpack_from(message)[1:]
 
 
 def message_with(number: float) -> bytes:
-    """A std_msgs/Float64."""
+    """A std_msgs/Float64 as bytes."""
     return CDR_FLOAT64.pack(1, number)
 
 
 class JointMessage(NamedTuple):
-    """What a sensor_msgs/JointState holds but for its frame; stamp_ns: of its header."""
+    """The content of a sensor_msgs/JointState without its frame. stamp_ns: of its header."""
 
     stamp_ns: int = 0
     name: tuple[str, ...] = ()
@@ -142,7 +142,7 @@ class JointMessage(NamedTuple):
 
 
 class JointReader:
-    """Reads messages that mostly are about the same joints."""
+    """Reads JointState messages, fast if they are about the same joints as the one before."""
 
     def __init__(self) -> None:
         self._head = b''  # of the newest message, from its frame to its names
@@ -157,7 +157,7 @@ class JointReader:
             count, = unpack_from('<I', message, at)
             at += 4
             if count:
-                at += (4 - at) % 8  # the encoding before does not count
+                at += (4 - at) % 8  # alignment begins after the four bytes of the encoding
             fields.append(unpack_from(f'<{count}d', message, at))
             at += 8 * count
         return JointMessage(seconds * 10**9 + nanoseconds, self._name, *fields)
@@ -171,9 +171,9 @@ class JointReader:
 
 
 def joint_message(content: JointMessage) -> bytes:
-    """A sensor_msgs/JointState without a frame."""
+    """A sensor_msgs/JointState without a frame, as bytes."""
     head, lists = _head_of('', content.name), content[2:]
-    # As in C, which aligns as CDR does.
+    # In native mode struct aligns as CDR does.
     layout = ''.join(f'I{len(values)}d' if values else 'I' for values in lists)
     return LITTLE_ENDIAN + pack(
         f'@iI{len(head)}s{layout}', *divmod(content.stamp_ns, 10**9), head,

@@ -1,4 +1,4 @@
-"""A node as a process: arguments, start-up, work, events, signals, shutdown, exit code."""
+"""Run a node as a process: arguments, start-up, work, events, signals, shutdown, exit code."""
 
 import argparse
 import contextlib
@@ -54,7 +54,7 @@ ENABLED = os.environ.get('BACKLASH_ROS_EVENTS') == '1'
 
 
 def emit(event: str, **content: object) -> None:
-    """Tell the program that started the node, with BACKLASH_ROS_EVENTS=1, a JSON object a line."""
+    """Print an event as a line of JSON for the parent process, if BACKLASH_ROS_EVENTS=1."""
     if ENABLED:
         print(json.dumps({'event': event} | {
             # JSON has no nan.
@@ -64,7 +64,7 @@ def emit(event: str, **content: object) -> None:
 
 
 def split_arguments(args: list[str] | None) -> tuple[list[str], list[str]]:
-    """What ROS has nothing to do with, and all between --ros-args and --."""
+    """Split arguments into those that are not for ROS, and those from --ros-args to --."""
     arguments, of_ros, inside = sys.argv[1:] if args is None else args, [], False
     for argument in arguments:
         inside = (inside or argument == '--ros-args') and argument != '--'
@@ -74,15 +74,15 @@ def split_arguments(args: list[str] | None) -> tuple[list[str], list[str]]:
 
 
 class ProcessNode(Node):
-    """A node that is the purpose of its process: parameters checked, then work until stopped.
+    """A node with a process of its own: checks its parameters, then works until it is stopped.
 
-    Its `settings` are complete and checked; all or none of them change. parameters_of: the
-    executable whose parameters it reads. signals: the SIGINT and SIGTERM that have come.
+    Its `settings` are complete and checked; a change applies as a whole or not at all.
+    parameters_of: executable whose parameters it has. signals: the SIGINT and SIGTERM received.
     """
 
     settings: Parameters
-    reconfigurable = False  # whether all but the fixed ones may change while it is unconfigured
-    configured = False  # whether only live ones may change now, of those that are not read-only
+    reconfigurable = False  # whether all but fixed parameters may change while it is unconfigured
+    configured = False  # whether, of these, only live parameters may change now
 
     def __init__(self, executable: str, parameters_of: str = '') -> None:
         super().__init__(executable)
@@ -92,29 +92,29 @@ class ProcessNode(Node):
         self.exit_code = DONE
 
     def check_change(self, p: Parameters) -> None:
-        """Raise ParameterError for values that the node cannot take up."""
+        """Raise ParameterError for values that the node cannot use now."""
 
     def take_up(self, before: Parameters) -> None:
-        """Use the settings, which have changed."""
+        """Use the settings, which have just changed."""
 
     @property
     def stopping(self) -> bool:
         return bool(self.signals)
 
     def count_publishers(self, topic_name: str) -> int:
-        # rclpy would count by the name before it is remapped.
+        # rclpy does not remap the name before it counts.
         return super().count_publishers(self.resolve_topic_name(topic_name))
 
     def every(self, period_s: float, action: Callable[[], Any]) -> Timer:
-        """Call action so often, on the steady clock."""
+        """Call action every period_s [s] of the steady clock."""
         return self.create_timer(period_s, action, clock=RosClock(clock_type=ClockType.STEADY_TIME))
 
     def listen(
         self, message_type: type[Any], topic: str, callback: Callable[[Any, Any], None],
         qos: QoSProfile | int, raw: bool = False, polled: bool = False,
     ) -> Subscription:
-        """Subscribe with times and number of the message; polled: called by serve_polled alone."""
-        # rclpy takes such callbacks but does not say so in its types.
+        """Subscribe; callback gets messages and their info. polled: only in serve_polled."""
+        # rclpy accepts such callbacks, but its types do not.
         untyped: Any = callback
         group: Any = Polled
         return self.create_subscription(
@@ -122,7 +122,7 @@ class ProcessNode(Node):
         )
 
     def listen_to_clock(self, hear: Callable[[int], object], qos: QoSProfile | int) -> None:
-        """Call hear with the simulated time of each tick [ns]."""
+        """Call hear with the simulated time [ns] of each tick."""
         def hear_tick(tick: Clock) -> None:
             hear(Time.from_msg(tick.clock).nanoseconds)
 
@@ -131,27 +131,27 @@ class ProcessNode(Node):
     def listen_to_diagnostics(
         self, hear: Callable[[DiagnosticStatus, dict[str, str], int], None],
     ) -> Subscription:
-        """Call hear with each status, its values by key, and when it came [ns]; a polled one."""
+        """Call hear with each status, its values by key, and its arrival [ns]; it is polled."""
         def hear_all(message: DiagnosticArray, info: dict[str, Any]) -> None:
             for status in message.status:
                 values = {each.key: each.value for each in status.values}
                 hear(status, values, info['received_timestamp'])
 
-        # Those of all nodes of the domain: some robots have many.
+        # From all nodes of the domain, of which some robots have many.
         return self.listen(DiagnosticArray, DIAGNOSTICS, hear_all, 100, polled=True)
 
     def work(self, executor: PromptExecutor) -> None:
-        """Do what the node is for until `stopping`."""
+        """Work until `stopping`; nodes override this."""
         while not self.stopping:
             executor.spin_once()
 
     def finish(self) -> None:
-        """Say what there is to say at the end; called once, whatever ended the work."""
+        """Close and report; called once at the end, whatever ended the work."""
 
     def wait_until(
         self, executor: PromptExecutor, condition: Callable[[], object], awaited: str,
     ) -> bool:
-        """Work until condition holds; returns whether it does. awaited: for the log."""
+        """Spin until condition holds; returns False if a signal came. awaited: for the log."""
         remind = time.monotonic() + 5.0
         while not (self.stopping or condition()):
             executor.spin_once(timeout_sec=0.01)
@@ -161,8 +161,8 @@ class ProcessNode(Node):
         return not self.stopping
 
     def declare_settings(self, executable: str) -> None:
-        """Declare what the table says of this executable; raises ParameterError."""
-        # rclpy has no other way to ask for all names that were given; two are declared by itself.
+        """Declare the parameters that the table has for this executable; raises ParameterError."""
+        # rclpy has no other way to get all names that were given; it declares two of them itself.
         given = {
             name: _given_value(parameter)
             for name, parameter in self.handle.get_parameters(RosParameter).items()
@@ -171,13 +171,13 @@ class ProcessNode(Node):
         self.settings = parameters = Parameters(given)
         values = {p.name: parameters[p.name] for p in BY_NAME.values() if executable in p.used_by}
         if executable == CONTROLLER:
-            # Of a joint's own parameters those that were given: all of them would be hundreds.
+            # Of the joints' own parameters only those that were given: there are hundreds.
             values |= {
                 name: parameters.of_joint(joint)[own] for name in given
                 for joint, _, own in [name.partition('.')] if joint in parameters.joint_names
             }
-        # With a value missing rclpy would tell none of those that it is asked for; that of an empty
-        # list has a type only here.
+        # If one value were missing, rclpy would return none of those it is asked for. An empty list
+        # gets its type here.
         for name in values:
             self.declare_parameter(
                 name, descriptor=ParameterDescriptor(dynamic_typing=True), ignore_override=True
@@ -196,9 +196,9 @@ class ProcessNode(Node):
             ))
 
     def set_parameters_atomically(self, parameter_list: list[RosParameter]) -> SetParametersResult:
-        """Set what differs from the present values, in the declared types.
+        """Set parameters that differ from the present values, in their declared types.
 
-        Command-line tools send 1e-6 as a text, and load whole files of mostly present values.
+        Command-line tools send 1e-6 as text, and load whole files whose values are mostly the same.
         """
         changes, values = [], {}
         try:
@@ -235,8 +235,8 @@ def run(
     """Run a node until its work or a signal ends it; return its exit code, or 2 for bad input."""
     arguments = sys.argv[1:] if args is None else args
     signals: list[int] = []
-    # The handlers of rclpy would raise KeyboardInterrupt anywhere and shut ROS down beneath a node
-    # that still has to say good-bye.
+    # The handlers of rclpy would raise KeyboardInterrupt anywhere and shut ROS down before the node
+    # has finished.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, frame: signals.append(number))
     try:
@@ -262,7 +262,7 @@ def run(
                 node.log.warning(complaint)
         node.signals = signals
         executor = PromptExecutor(node)
-        code = FAILED  # unless the work comes to its end
+        code = FAILED  # unless the work ends
         try:
             # A full collection would look through all of numpy and scipy and cost many samples.
             gc.collect()
@@ -272,14 +272,14 @@ def run(
         finally:
             node.finish()
             code = node.exit_code or code
-            # For the middleware to leave the network; a signal ends a node in a second.
+            # Time for the middleware to leave the network; a signal ends a node within a second.
             with exit_at_the_latest(0.4, code):
                 executor.shutdown()
                 Node.destroy_node(node)
                 rclpy.try_shutdown()
     finally:
         rclpy.try_shutdown()
-        # The interpreter gives handlers back before it ends, but leaves what is ignored.
+        # The interpreter resets handlers before it ends, but not ignored signals.
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.SIG_IGN)
     return code
@@ -287,14 +287,14 @@ def run(
 
 @contextlib.contextmanager
 def exit_at_the_latest(within_s: float, code: int) -> Iterator[None]:
-    """End the process with this exit code where the block takes longer than within_s [s].
+    """End the process with this exit code if the block takes longer than within_s [s].
 
-    Fast DDS 2.14 hangs for good in one of some hundreds of exits of participants that leave
-    together, with the interpreter locked: no thread of Python and no handler of a signal would
-    run. All work is done by then, so a timer of the C library ends the process instead.
+    When participants leave together, Fast DDS 2.14 hangs for good in one of some hundreds of exits,
+    with the interpreter locked, so that no Python thread or signal handler would run. All work is
+    done by then, so a timer of the C library ends the process instead.
     """
     for stream in (sys.stdout, sys.stderr):
-        with contextlib.suppress(OSError):  # nobody may be reading any more
+        with contextlib.suppress(OSError):  # the reader may have gone
             stream.flush()
     c, timer = ctypes.CDLL(None), ctypes.c_void_p()
     exit_now = ctypes.cast(c._exit, ctypes.c_void_p).value
@@ -313,12 +313,12 @@ def exit_at_the_latest(within_s: float, code: int) -> Iterator[None]:
 
 def _initialise(arguments: list[str]) -> None:
     prefer_loopback(os.environ)
-    # rcl would add a line without content to the one that says what is wrong.
+    # rcl would add a useless line to the one that says what is wrong.
     set_logger_level('rcl', LoggingSeverity.FATAL)
     try:
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:
-        # Where in the sources of rcl it was found helps nobody.
+        # Leave out the place in the sources of rcl.
         reason = str(error).split(', at /')[0]
         if 'Sequence should be of same type' in reason:
             reason += ': write all numbers of a list with a decimal point'
@@ -344,16 +344,16 @@ def _ros_parameter(name: str, value: Value) -> RosParameter:
 
 
 def unreached(file: str, executable: str, full_name: str) -> str:
-    """What to do with sections that seem to be meant for a node, where ROS 2 passes over all."""
+    """A complaint if sections of a file seem to be meant for a node but do not reach it, or ''."""
     import yaml  # most nodes start without a file
 
-    # ROS 2 itself has refused what cannot be read.
+    # ROS 2 itself has refused files that cannot be read.
     content = yaml.safe_load(Path(file).read_text(encoding='utf-8')) or ()
     namespace, _, own = full_name.strip('/').rpartition('/')
     meant = [section for section in (str(name).strip('/') for name in content) if
              difflib.get_close_matches(section.rpartition('/')[2], [own, executable], cutoff=0.8)]
     reaching = {f'**/{own}', f'*/{own}', full_name.strip('/')}
-    # One with a namespace may be for another axis.
+    # A section with a namespace may be for another axis.
     passed_over = [section for section in meant if not (namespace and '/' in section)]
     if not passed_over or not reaching.isdisjoint(meant):
         return ''
