@@ -1,4 +1,4 @@
-"""Which v acted over each sample interval: told from commands, from reports, or both."""
+"""Finds which v acted over each sample interval, from commands, from reports, or from both."""
 
 from collections import deque
 from math import inf, nan, sqrt
@@ -13,39 +13,39 @@ from backlash_ros.core.plant.transfer_function import Array
 
 Stamps = NDArray[np.int64]  # [ns], of one clock
 
-LOOKS = 10  # that tell the origin of reports, after which it counts as settled
-REPORTED = 0.9  # share of the samples that reports have to tell of to be believed
-# Outputs in a row with a report for each of their intervals after which reports are believed, and
-# without, after which they are given up. Messages that have nothing to do with the samples fit an
-# interval every other time at most: 20 times in a row by a chance of one in a million.
+LOOKS = 10  # conclusive looks at the origin of reports after which it counts as settled
+REPORTED = 0.9  # fraction of the samples that must have reports for these to be believed
+# Consecutive outputs with a report for each of their intervals after which reports are believed,
+# and without, after which they are given up. Messages unrelated to the samples match an interval
+# every other time at most: 20 times in a row with a probability of one in a million.
 CONSISTENT = 20
-# Commands and reports that may wait: more than a stall of the controller can leave behind.
+# Commands and reports that are kept: more than pile up while the controller stalls.
 KEPT_COMMANDS = 256
 
 
 def report_use(p: Parameters) -> str:
-    """What estimator.use_applied_control comes to; in lockstep every v is applied at once.
+    """Return the effective estimator.use_applied_control; in lockstep every v acts at once: false.
 
-    A driver may report v before or after control.delay_samples: auto leaves reports alone then.
+    With a delay, auto means false: a driver may report v before or after control.delay_samples.
     """
     use: str = p.estimator.use_applied_control
     return 'false' if p.lockstep or (use == 'auto' and p.control.delay_samples > 0) else use
 
 
 class ReportTrust:
-    """Whether reports are used at present: always, never, or as long as none is missing.
+    """Whether reports are used at present: always, never, or (auto) while none are missing.
 
-    They are from the first one on. A driver that leaves one out before CONSISTENT in a row were
-    there has to show as many first. use: as report_use has it.
+    With auto they are used from the first one on. A driver that leaves one out among the first
+    CONSISTENT has to send as many in a row before they are used again. use: see report_use.
     """
 
     def __init__(self, use: str) -> None:
         self.trusted, self._auto = use == 'true', use == 'auto'
         self._contrary = 0  # outputs in a row that speak against `trusted`
-        self._first = 0  # outputs in a row that had theirs from the beginning; CONSISTENT: settled
+        self._first = 0  # outputs in a row with reports from the first one on; CONSISTENT: settled
 
     def note(self, complete: bool) -> bool:
-        """Note whether each interval before an output had its report; returns `trusted`."""
+        """Note whether each interval before an output had its report; return `trusted`."""
         if self._auto and self._first < CONSISTENT:
             self._first = self._first + 1 if complete else CONSISTENT if self.trusted else 0
             self.trusted = complete
@@ -57,12 +57,12 @@ class ReportTrust:
 
 
 class ReportOrigin:
-    """Finds where reports have their zero: a motor encoder may not have been zeroed.
+    """Finds the zero of the reports, as a motor encoder may not have been zeroed.
 
     A first-order lag r(k) - b = p (r(k-1) - b) + (1 - p) v(k) is a straight line of r(k) - v(k)
-    over r(k-1) - v(k); at rest or saturated p = 1. What is left of it has to be small beside b: a
-    driver that limits v to one side has no other origin. value: b, 0 until another one is certain.
-    before: what was known at the first report.
+    over r(k-1) - v(k); at rest or saturated p = 1. Its residuals must be small beside b, as a
+    driver that limits v to one side has no other zero. value: b; 0 until another one is certain.
+    before: the estimate at the first report.
     """
 
     def __init__(self) -> None:
@@ -71,16 +71,16 @@ class ReportOrigin:
         self.restart()
 
     def restart(self) -> None:
-        """Look again: the driver was restarted, and its encoder perhaps zeroed."""
+        """Look for it again: the driver was restarted, and its encoder perhaps zeroed."""
         self._looks = self._new = 0  # _new: pairs since the last look
         self._pairs: deque[tuple[float, float]] = deque(maxlen=201)
 
     def changed_by(self, report: float, command: float, known: Estimate | None = None) -> bool:
-        """Take in what was reported of an interval and commanded in it; whether `value` changed.
+        """Take in the reported and the commanded v of an interval; return if `value` has changed.
 
-        known: at present. What was learned beside another origin is void.
+        known: the present estimate; if it was learned with another `value`, it becomes void.
         """
-        look_after, correlated, significant = 20, 10.0, 5.0  # intervals, intervals, deviations
+        look_after, correlated, significant = 20, 10.0, 5.0  # intervals, intervals, std
         if not self._pairs:
             self.before = known
         if self._looks == LOOKS:
@@ -112,7 +112,7 @@ class ReportOrigin:
 
 
 def without_origin(reports: Array, commands: Array) -> Array:
-    """Reports of a record as they would be from an encoder that was zeroed; nan where none is."""
+    """Return the reports of a record minus their origin; nan where there is no report."""
     origin = ReportOrigin()
     for report, command in zip(reports.tolist(), commands.tolist(), strict=True):
         if report == report and command == command:
@@ -121,11 +121,11 @@ def without_origin(reports: Array, commands: Array) -> Array:
 
 
 class CommandHistory:
-    """Published commands by time [ns], and applied ones where the driver reports them.
+    """Published commands by time [ns], and the applied ones if the driver reports them.
 
-    The driver applies over an interval the newest v it has at its end. A v that cannot have been
-    there then came too late; v is as long under way as y is. newest_ns: when the newest command
-    left, own or of another controller. output_ns: stamp of the newest output that was used.
+    The v of an interval is the newest one that the driver has at its end; one that cannot have
+    arrived by then is late. v is taken to travel as long as y. newest_ns: when the newest command
+    left, of whichever controller. output_ns: stamp of the newest output that was used.
     """
 
     def __init__(self, sample_period_s: float, use: str = 'true',
@@ -149,17 +149,17 @@ class CommandHistory:
         self.newest_ns = stamp_ns
 
     def report(self, v: float, stamp_ns: int) -> None:
-        """Note an applied v and when the driver said so, just before the output it led to."""
+        """Note an applied v and its stamp; it is reported just before the output it led to."""
         self._reported.append((stamp_ns, v))
 
     def over(self, intervals: int, end_ns: int, due_ns: float) -> tuple[list[float], list[float]]:
-        """v over each of the newest intervals, oldest first, the last of which ended at end_ns.
+        """Return v over each of the newest intervals, oldest first, and a v for each that may have
+        acted instead: a command that left within a period of the deciding time, or nan.
 
-        due_ns: when it should have. And for each the command that left within a period of the time
-        that decides, and so may have acted instead; nan where there is none.
+        end_ns, due_ns: when the last interval ended, and when it should have.
         """
-        # A driver that was held up reads y first, and then the commands that came meanwhile; what
-        # left later than messages are under way was not there.
+        # A driver that was held up reads y before the commands that came meanwhile, so a command
+        # counts only if it left earlier than that by the time that messages take.
         latest_ns = min(due_ns, end_ns) - self._transit_ns
         times_ns = [latest_ns - i * self._period_ns for i in range(intervals - 1, -1, -1)]
         self.counts.late += self._published[-1][0] >= times_ns[0]
@@ -167,17 +167,17 @@ class CommandHistory:
         return list(acted), list(others)
 
     def newest_report(self, end_ns: int) -> float:
-        """The v reported for the interval that ended at end_ns, nan if there is a newer command."""
+        """Return the v reported for the interval up to end_ns, or nan if a command is newer."""
         if self._reported and end_ns > self.newest_ns + self._period_ns \
                 and self._reported[-1][0] > end_ns - 1.5 * self._period_ns:
             return self._reported[-1][1] - self.origin.value
         return nan
 
     def reported_over(self, intervals: int, end_ns: int, unsent: int = 0) -> list[float]:
-        """Reports since the last output, one per interval; empty where they are not to be used.
+        """Return the reports since the last output, one per interval, or [] if not to be used.
 
-        unsent: intervals at whose end the driver was held up, neither measured nor reported: the v
-        of its next report was in use all the time.
+        unsent: intervals at whose end the driver was held up, and neither measured nor reported:
+        the v of its next report acted all the time.
         """
         begin_ns, self.output_ns = self.output_ns, end_ns
         stamp_ns, reports = begin_ns, []
@@ -195,7 +195,7 @@ class CommandHistory:
         return reports if complete else []
 
     def at(self, time_ns: float) -> tuple[float, float]:
-        """The newest v that had left by then, and the one beside it that may have been in use."""
+        """Return the newest v that had left by then, and the v next to it that may have acted."""
         later_ns, later = inf, nan
         for i in range(len(self._published) - 1, -1, -1):
             stamp_ns, v = self._published[i]
@@ -203,7 +203,7 @@ class CommandHistory:
                 since, until = time_ns - stamp_ns, later_ns - time_ns
                 if min(since, until) > self._period_ns:
                     return v, nan
-                # It may not have arrived yet, or the next one had by the clock of another machine.
+                # It may not have arrived yet; or the next one has, by the clock of another machine.
                 older = self._published[i - 1][1] if i else nan
                 return v, older if since <= until else later
             later_ns, later = stamp_ns, v
@@ -212,7 +212,7 @@ class CommandHistory:
 
 def v_of_intervals(index: NDArray[np.int64], output_ns: Stamps, command_ns: Stamps, v: Array,
                    reported: bool) -> Array:
-    """v over the interval after each sample, shape (N,), N = index[-1] + 1; nan before any v.
+    """Return v over the interval after each sample, (N,), N = index[-1] + 1; nan before any v.
 
     index: number of each sample whose y was heard, rising from 0. output_ns: stamps of these y.
     command_ns, v (M,): messages of v in the order of time. reported: whether they are reports of
@@ -225,8 +225,8 @@ def v_of_intervals(index: NDArray[np.int64], output_ns: Stamps, command_ns: Stam
     if reported:
         until = np.searchsorted(commands, outputs, side='right')
         intervals, reports = np.diff(index), np.diff(until)
-        # One each: in their order, since those of a driver that was held up come in a heap. One
-        # alone: nothing was sampled in between, and its v was in use all the time.
+        # One report per interval: in their order, as those of a driver that was held up come in a
+        # burst. A single one: nothing was sampled in between, and its v acted all the time.
         for i in np.flatnonzero((intervals > 1) & ((reports == intervals) | (reports == 1))):
             acted[index[i]:index[i + 1]] = v[until[i]:until[i + 1]]
     return acted

@@ -1,4 +1,4 @@
-"""From an output to a command: count → learn → control → limit → send → tell; of all joints."""
+"""From outputs to commands, for all joints: count → learn → control → limit → send → report."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -21,11 +21,11 @@ from backlash_ros.core.parameters import Parameters
 
 
 class Phase(Enum):
-    """Whether a loop commands, and with what it begins: one small state machine.
+    """State of a loop: whether it commands, and whether it knows the state of the plant.
 
-    BEGINS → RUNS at the first answer, RUNS → BEGINS when the state of the plant is unknown. Both →
-    SILENT after timeout.plant_output, and from there → BEGINS with the next output. All →
-    STANDS_DOWN when another controller was first, and from there → BEGINS when it is gone.
+    BEGINS → RUNS with the first answer; RUNS → BEGINS when the state of the plant is lost. Both →
+    SILENT after timeout.plant_output without an output; SILENT → BEGINS with the next one. All →
+    STANDS_DOWN if another controller was first; STANDS_DOWN → BEGINS when that one is gone.
     """
 
     BEGINS = 'begins'
@@ -35,9 +35,9 @@ class Phase(Enum):
 
 
 class Driver(NamedTuple):
-    """What a loop can ask about its driver: the clock of its stamps, who else tells of it.
+    """What a loop needs from outside. now_ns: clock of the stamps. may_report: may v be reported?
 
-    applied: its reports of v. warn: tells the user. steady_s: never set [s]. wall_ns: of messages.
+    applied: topic of these reports. warn: warns the user. steady_s: monotonic. wall_ns: of sent_ns.
     """
 
     now_ns: Callable[[], int]
@@ -50,19 +50,19 @@ class Driver(NamedTuple):
 
 @dataclass
 class Newest:
-    """What has come last, and when, on the steady clock [s]; nan before. unanswered: outputs."""
+    """The newest reference, and when y_m and y last came [s, steady clock]; nan before."""
 
     y_m: float = nan
     y_m_at: float = nan
     y_at: float = nan
-    unanswered: int = 0
+    unanswered: int = 0  # outputs that had to wait for a known v
 
 
 class ControlLoop:
-    """Answers outputs with commands, whatever the driver does.
+    """Answers the outputs of one joint with commands, whatever the driver does.
 
-    estimate: to begin with, None for what was known before. v: the command that acts; None, and
-    then taken for 0, as long as nobody knows (knows_v). executor: makes the fits, None: at once.
+    estimate: to begin with; None for that of known_before(p). v: the command that acts; None if it
+    is unknown, and then taken for 0 (knows_v: False). executor: computes the fits; None: at once.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class ControlLoop:
         executor: Executor | None = None,
     ) -> None:
         self.counter, self.heard, self.phase = counter, Newest(), Phase.BEGINS
-        # Within six deviations of its noise y stands still.
+        # Within six standard deviations of its noise, y counts as standing still.
         counts = LoopStatistics(still_band=6.0 * p.estimator.output_noise_std)
         self.commands = CommandHistory(p.sample_period, report_use(p), counts)
         self.executor = executor or Executor()
@@ -80,8 +80,8 @@ class ControlLoop:
         if v is not None:
             self.core.motion = at_rest(v)
         self.driver, self._p, self._send = driver, p, send
-        self._gap = NEXT_SAMPLE  # what is missing since the newest output that was used
-        self._ending: Iterator[float] = iter(())  # commands that lead v to its end
+        self._gap = NEXT_SAMPLE  # samples missing since the newest output that was used
+        self._ending: Iterator[float] = iter(())  # last commands, see `end`
 
     @property
     def statistics(self) -> LoopStatistics:
@@ -114,7 +114,7 @@ class ControlLoop:
     # --- at every sample -------------------------------------------------------------------------
 
     def take_reference(self, y_m: float) -> None:
-        """Take in a reference; an absurd one is counted and the last one holds."""
+        """Take in a reference; an implausible one is only counted, and the last one holds."""
         if plausible(y_m):
             self.heard.y_m, self.heard.y_m_at = y_m, self.driver.steady_s()
         else:
@@ -127,9 +127,9 @@ class ControlLoop:
             self.statistics.bad_reports += 1
 
     def answer(self, output: Output, arrival: Arrival | None = None) -> ControlStep | None:
-        """Count y(k), learn from it, and send v(k); None where the message brings no command.
+        """Count y(k), learn from it, and send v(k); return None if no command follows from it.
 
-        arrival: of an output that was counted already.
+        arrival: of an output that has been counted already.
         """
         if not self._is_usable(output, arrival or self.counter.count(*output.counted)):
             return None
@@ -141,22 +141,22 @@ class ControlLoop:
         return step
 
     def skip(self, arrival: Arrival) -> None:
-        """Leave a sample unanswered of which this loop has no output."""
+        """Note a sample of which this loop has no output."""
         if arrival.is_sample and not self.standing_down:
             self._note_missing(arrival)
             self._note_missing(Arrival(missing=1), lost=False)
 
     def send(self, v: float) -> None:
-        """Send a command and note when it left; nothing while another controller commands."""
+        """Send a command and note when it left; do nothing while another controller commands."""
         if not self.standing_down:
-            if v != self.v:  # it is none of the core
+            if v != self.v:  # it does not come from the core
                 self.core.motion = Motion(v, v - self.v, v)
             self.knows_v = True
             self._send(v)
             self.commands.publish(v, self.driver.now_ns())
 
     def _is_usable(self, output: Output, arrival: Arrival) -> bool:
-        """Count a message of y; returns whether there is a command to be made of it."""
+        """Count a message of y; return whether it is to be answered with a command."""
         statistics = self.statistics
         if self.standing_down or not arrival.is_sample:
             statistics.extra += not self.standing_down
@@ -170,7 +170,7 @@ class ControlLoop:
                 return self._may_answer(output)
             statistics.without_reference += 1
         else:
-            # A sensor that has nothing to say is as good as silent.
+            # A sensor without a valid value is as good as silent.
             statistics.bad_outputs += 1
         self._note_missing(Arrival(missing=1), lost=False)
         return False
@@ -179,13 +179,13 @@ class ControlLoop:
         _, missing, restarted, unsent = self._gap
         self._gap = Arrival(True, missing + arrival.missing, restarted or arrival.restarted,
                             unsent + arrival.unsent)
-        # What came before the first sample that is used was not lost: nobody listened.
+        # Nothing is lost before the first sample that is used: the loop was not running.
         if lost and self.phase is Phase.RUNS and not arrival.restarted:
             self.statistics.lost += arrival.missing
             self.statistics.unsent += arrival.unsent
 
     def _may_answer(self, output: Output) -> bool:
-        """Begin anew where too much is missing; returns whether a v to go on from is known."""
+        """Begin anew if too much is missing; return whether the output may be answered."""
         p, gap = self._p, self._gap
         stalled = not p.lockstep and 0.0 < p.timeout.plant_output < gap.missing * p.sample_period
         too_long = self.phase is Phase.RUNS and (gap.missing > LONGEST_GAP or stalled)
@@ -197,7 +197,7 @@ class ControlLoop:
         return self.phase is Phase.RUNS or p.lockstep or self._may_begin(output)
 
     def _may_begin(self, output: Output) -> bool:
-        """Whether it is known from which v the first command goes on, or waiting is in vain."""
+        """Return whether the v that acts is known, or waiting for a report of it is in vain."""
         p, driver = self._p, self.driver
         if missing := p.missing_limits:
             driver.warn(f'{", ".join(missing)}: not set, so nothing keeps v within what the '
@@ -212,7 +212,7 @@ class ControlLoop:
         if driver.may_report() and self.heard.unanswered <= longest:
             return False
         if p.io.style == 'joint_state_topic':
-            # v and y are the same angle but for the gap: the joint holds where it stands.
+            # Apart from the gap v and y are the same angle: the joint stays where it is.
             self._go_on_from(output.y / self.estimate.m)
         else:
             driver.warn('nobody says which v acts now, so the first command goes on from 0: '
@@ -230,7 +230,7 @@ class ControlLoop:
             return core.step(y, y_m)
         if self._p.lockstep:
             return core.step(y, y_m, lost)
-        # Late commands are counted even where the driver says which ones it applied.
+        # Late commands are counted even if the driver reports which ones it applied.
         acted, others = commands.over(lost + 1, stamp_ns, self.counter.due_ns)
         reports = commands.reported_over(lost + 1, stamp_ns, unsent)
         origin, told = commands.origin, acted[-1] / core.command_of(1.0)
@@ -245,13 +245,13 @@ class ControlLoop:
 
     @property
     def is_overdue(self) -> bool:
-        """Whether the driver has been silent for too long, and that is new."""
+        """Whether the driver has been silent for too long and has not been given up yet."""
         silent_s = self.driver.steady_s() - self.heard.y_at
         return self.phase in (Phase.BEGINS, Phase.RUNS) \
             and 0.0 < self._p.timeout.plant_output < silent_s
 
     def give_up(self) -> None:
-        """The driver is silent: whenever it comes back, its state will be unknown."""
+        """Give the silent driver up: end as on_timeout says, and forget the state of the plant."""
         if self.phase in (Phase.BEGINS, Phase.RUNS):
             self.phase = Phase.SILENT
             self.renew(self.estimate)
@@ -271,7 +271,7 @@ class ControlLoop:
         self.renew(self.estimate)
 
     def end(self, action: str) -> None:
-        """Have send_next lead v to its end as on_stop or on_timeout say, if anybody knows v."""
+        """Have send_next send the last commands of an action, see last_commands, if v is known."""
         self._ending = last_commands(action, self.core.motion, lambda: self.core.limits) \
             if self.knows_v else iter(())
 
@@ -282,7 +282,7 @@ class ControlLoop:
         return v is not None
 
     def renew(self, estimate: Estimate | None) -> None:
-        """Go on from the present v with a new core that begins with these estimates, if any."""
+        """Continue from the present v with a new core, which begins with these estimates if any."""
         if self.phase is Phase.RUNS:
             self.phase = Phase.BEGINS
         before = self.core
@@ -303,7 +303,7 @@ class ControlLoop:
         self.core.compensating = compensating
 
     def take_up(self, p: Parameters) -> None:
-        """Use other values of the live parameters; what was learned stays."""
+        """Apply new values of the live parameters, and keep what was learned."""
         self._p, core = p, self.core
         core.limits = build_limits(p)
         core.inverse.direction_band = p.inverse.direction_band
@@ -318,11 +318,11 @@ class ControlLoop:
 
 
 class JointLoops:
-    """Answers a message about all joints with one of commands for all.
+    """Answers each message about all joints with one message of commands for all.
 
-    driver: what can be asked about that of a joint. before: estimates to begin with, of joints that
-    do not begin with what was known before. by_name: in the order of `joints`; a single one may be
-    nameless. turns: for each sample the loop that may look after fits then, or none.
+    driver: returns the Driver of a joint. before: initial estimates, of joints that do not begin
+    with known_before(p). by_name: in the order of `joints`; a single one may be nameless. turns:
+    for each sample, the loop that may attend to its fits then, or None.
     """
 
     def __init__(
@@ -332,7 +332,7 @@ class JointLoops:
         executor: Executor | None = None,
     ) -> None:
         self.counter, self._send, self._together = counter, send, p.io.together
-        self._commands: dict[str, float] = {}  # that wait for the message
+        self._commands: dict[str, float] = {}  # to be sent in the next message
         self.by_name = {
             joint: ControlLoop(
                 p.of_joint(joint), partial(self._commands.__setitem__, joint), driver(joint),
@@ -340,18 +340,18 @@ class JointLoops:
             ) for joint in p.joint_names
         }
         self.loops = tuple(self.by_name.values())
-        # To look after fits at every sample would cost as much as the sample; they take longer.
+        # Attending to fits at every sample would double its cost, and a fit takes longer anyway.
         pause = max(round(0.05 / p.sample_period / len(self.loops)), 1)  # samples
         self.turns = cycle([turn for loop in self.loops for turn in (loop, *[None] * (pause - 1))])
 
     def answer(self, outputs: Mapping[str, Output]) -> dict[str, ControlStep]:
-        """Send v(k) for y(k) of all joints that there are; returns the steps that were made."""
+        """Send v(k) for the y(k) of all joints in `outputs`; return the steps that were made."""
         arrival = self.counter.count(*next(iter(outputs.values())).counted)
         lost = self._together and any(
             loop.silent and not (joint in outputs and isfinite(outputs[joint].y))
             for joint, loop in self.by_name.items())
         if lost:
-            outputs = {}  # an arm of which one joint is still lost does not begin
+            outputs = {}  # an arm does not begin while one of its joints is still lost
         steps = {}
         for joint, loop in self.by_name.items():
             if joint not in outputs:
@@ -359,7 +359,7 @@ class JointLoops:
             elif (step := loop.answer(outputs[joint], arrival)) is not None:
                 steps[joint] = step
         self._send_waiting()
-        # What the next commands need not wait for then.
+        # Work that the next commands then need not wait for.
         self.counter.sender.learn()
         for joint in steps:
             self.by_name[joint].core.structure.prepare()
@@ -370,14 +370,14 @@ class JointLoops:
             self.by_name[joint].take_reference(value)
 
     def give_up_silent(self) -> bool:
-        """Give up drivers that are newly silent, or all joints; returns whether any is."""
+        """Give up joints that are newly silent, or all that go together; return whether any is."""
         overdue = [loop for loop in self.loops if loop.is_overdue]
         for loop in self.loops if overdue and self._together else overdue:
             loop.give_up()
         return bool(overdue)
 
     def end(self, action: str) -> list[ControlLoop]:
-        """As ControlLoop.end; returns the loops that command."""
+        """As ControlLoop.end, for the loops that command; return these."""
         ending = [loop for loop in self.loops if loop.statistics.used and not loop.standing_down]
         for loop in ending:
             loop.end(action)

@@ -1,4 +1,4 @@
-"""Why the loop is not well: one table of conditions over what was counted, and their log."""
+"""Diagnosis of the loop: one table of conditions on what was counted, and a log of findings."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -15,18 +15,18 @@ from backlash_ros.core.parameters import Parameters
 if TYPE_CHECKING:
     from backlash_ros.core.loop.control_loop import ControlLoop
 
-# What passes by itself as a rule is told only after so long: at the third of the looks, which come
-# once a second, be it a little early.
+# A finding that usually passes by itself is logged only after so long: at the third look, as looks
+# come once a second, even if that is a little early.
 LASTS_S = 1.5
-AGAIN_S = 10.0  # until the same cause is told once more
+AGAIN_S = 10.0  # before the same cause is logged once more
 LONGEST_TEXT = 99  # `ros2 topic echo` cuts off at 128, and a terminal line holds more besides
-# Share of late, lost or bad samples from which on the loop is told to suffer from them.
+# Fraction of late, lost or bad samples above which they are a finding.
 TROUBLE = 0.01
-BEHIND_S = 10.0  # that a fit is late, longer than its process pauses so as to spare the loop
+BEHIND_S = 10.0  # delay of a fit that is a finding: its process may pause, but not for so long
 UNNAMED = 'a node without a name'
-SKEW = 0.5  # of a period: time from stamp to arrival that only a wrong clock or a slow way explains
+SKEW = 0.5  # of a period from stamp to arrival: only a wrong clock or a slow network takes as long
 LATE_KINDS = ('late', 'lost', 'unsent')
-# Kinds of findings that pass by themselves as a rule.
+# Kinds of findings that usually pass by themselves.
 PASSING_KINDS = (*LATE_KINDS, 'waiting for output', 'waiting for reference', 'unheard', 'clock')
 # Kinds of findings about the messages, which are the same for all joints of a controller.
 OF_MESSAGES = frozenset((
@@ -36,7 +36,7 @@ OF_MESSAGES = frozenset((
 
 
 class Level(IntEnum):
-    """How bad it is, in the numbers of diagnostic_msgs/DiagnosticStatus."""
+    """Severity, by the numbers of diagnostic_msgs/DiagnosticStatus."""
 
     OK = 0
     WARN = 1
@@ -44,9 +44,9 @@ class Level(IntEnum):
 
 
 class Finding(NamedTuple):
-    """One line of what goes on. kind: the same word for the same cause, whatever its figures.
+    """One line of the diagnosis. kind: the same word for the same cause, whatever its figures.
 
-    lasting: worth a line of the log only once it has lasted, as it passes by itself as a rule.
+    lasting: logged only once it has lasted, as it usually passes by itself.
     """
 
     level: Level
@@ -58,8 +58,8 @@ class Finding(NamedTuple):
 class LevelLog:
     """Writes one line when the level or the cause changes, and one when all is well again.
 
-    What comes and goes is told once: that it is well again only after it has been so for LASTS_S,
-    and the same cause again only after AGAIN_S.
+    A cause that comes and goes is written once: all must be well for LASTS_S before that is
+    written, and the same cause follows only after AGAIN_S.
     """
 
     def __init__(self, write: Callable[[Level, str], None]) -> None:
@@ -84,7 +84,7 @@ class LevelLog:
 
 
 def short(name: str) -> str:
-    """The end of a long name, so that the cure behind it is not cut off."""
+    """Return the end of a long name, so that the advice after it is not cut off."""
     if len(name) <= 24:
         return name
     last = name.rsplit('/', 1)[-1]
@@ -94,7 +94,7 @@ def short(name: str) -> str:
 class Peer(NamedTuple):
     """Another publisher or subscriber of a topic. kind: its message type without the package.
 
-    unfit: why no message passes: 'type', 'reliability', 'qos', or empty if it does.
+    unfit: why no messages get through: 'type', 'reliability', 'qos', or empty if they do.
     """
 
     name: str
@@ -106,7 +106,7 @@ class Peer(NamedTuple):
 
 
 class TopicFigures(NamedTuple):
-    """A topic of the loop: its name, the wanted type without the package, who else is on it."""
+    """A topic of the loop: its name, expected type without the package, and other nodes on it."""
 
     name: str
     kind: str = 'Float64'
@@ -130,7 +130,7 @@ class Neighbours(NamedTuple):
 
 
 class Learning(NamedTuple):
-    """How the learning goes. given: the estimates are taken as the parameters give them.
+    """Progress of learning. given: whether the estimates are constants that no law has learned.
 
     status: None before the first command. inconsistent_s: for how long it has been INCONSISTENT.
     """
@@ -144,12 +144,12 @@ class Learning(NamedTuple):
 
 @dataclass(kw_only=True)
 class LoopFigures(Counts):
-    """What the controller knows of the last few seconds; the counts are those gained in them.
+    """Figures of the loop for the diagnosis; all counts are those of the last few seconds.
 
-    wraps: times that y jumped by 2 pi in them; dead_workers: processes for fits that died.
-    silent_s: timeout that has passed without y, 0 if it has not; reference_silent_s: likewise, inf
-    before the first y_m. still: newest values of y in a row that are equal within its noise.
-    v_swing: how far v has moved meanwhile, and gap, nan while it is not learned [unit of v].
+    wraps: times that y jumped by 2 pi. dead_workers: processes for fits that died. silent_s:
+    timeout that has passed without y, 0 if it has not; reference_silent_s: the same for y_m, inf
+    before the first one. still: newest values of y in a row that are equal within its noise.
+    v_swing: highest minus lowest v meanwhile; gap: nan until it is learned [unit of v].
     """
 
     timing: Timing
@@ -168,15 +168,15 @@ class LoopFigures(Counts):
 
 def figures_of_loop(loop: 'ControlLoop', p: Parameters, timing: Timing,
                     gained: Mapping[str, Any], around: Neighbours) -> LoopFigures:
-    """What is known of a loop. gained: counts lately."""
+    """Collect the figures of a loop. gained: its counts of the last few seconds."""
     statistics, estimate, law = loop.statistics, loop.estimate, loop.core.estimator
-    # Hardware on topics falls silent where all joints are where they belong.
+    # With joint_state_topic no references are sent while all joints are where they belong.
     may_be_silent = p.lockstep or p.io.style == 'joint_state_topic'
     unreferred_s = loop.driver.steady_s() - loop.heard.y_m_at
     unreferred = not may_be_silent and 0.0 < p.timeout.reference < unreferred_s
     return LoopFigures(
         **gained, around=around,
-        # In lockstep the outputs come as fast as the machine goes.
+        # In lockstep the outputs come as fast as the machine computes.
         timing=Timing(p.sample_period) if p.lockstep else timing,
         learning=Learning(
             estimate.status if statistics.used else None, law.report,
@@ -193,16 +193,16 @@ Row = tuple[str, Level, bool, str]  # kind, level, whether it holds, text with f
 
 
 def findings_of(f: LoopFigures) -> list[Finding]:
-    """All that is to be said, the likeliest cause first; never empty.
+    """Return all findings, the likeliest cause first; never empty.
 
-    The model is blamed only where nothing else explains why y does not follow from v: an estimate
-    that is held for a while because samples are late or lost is a warning about these.
+    The model is blamed only if nothing else explains why y does not follow from v: an estimate that
+    is held for a while because samples are late or lost is a warning about the samples.
     """
     causes = _findings(causes_of(f))
     state, law = state_beside({cause.kind for cause in causes}, f), f.learning.law
     if state.kind == 'model':
-        # What the fit has found out itself says more than what is late or missing; a wrong sign
-        # drives v into its limits besides, and comes of no clock.
+        # What the fit itself has found outweighs what is late or missing. A wrong sign also drives
+        # v into its limits, and no clock causes it.
         lesser = list(LATE_KINDS)
         if law.wrong_sign or law.coasts or _is_unexplained(law):
             lesser += ['unreported']
@@ -213,7 +213,7 @@ def findings_of(f: LoopFigures) -> list[Finding]:
 
 
 def _findings(rows: Iterable[Row]) -> list[Finding]:
-    # Most nodes get their name soon after they are found.
+    # Most nodes get their names soon after they are discovered.
     return [
         Finding(level, kind, text if len(text) <= LONGEST_TEXT else text[:LONGEST_TEXT - 1] + '…',
                 kind in PASSING_KINDS or UNNAMED in text)
@@ -247,7 +247,7 @@ def _unheard(around: Neighbours) -> list[Row]:
 
 
 def causes_of(f: LoopFigures) -> tuple[Row, ...]:
-    """The table of causes, the likeliest first."""
+    """Return the table of causes, the likeliest first."""
     _, warn, error = Level
     y, y_m, v, rivals = f.around
     timing, status = f.timing, f.learning.status
@@ -259,19 +259,19 @@ def causes_of(f: LoopFigures) -> tuple[Row, ...]:
         return f'waiting for {topic}: ' + (f'{topic.heard[0]} is there but sends none'
                                            if topic.heard else f'nobody publishes it, {start}')
 
-    # In samples where the gap is known, else in time.
+    # By samples and the gap if that is known, else by time.
     stands_still = f.still >= 20 and f.v_swing > f.gap if isfinite(f.gap) \
         else f.still * period_s >= 5.0 and f.v_swing > 0.0
     return (
         *_unheard(f.around),
-        # What comes is of no use.
+        # Useless messages.
         ('bad outputs', warn if f.used else error, f.bad_outputs > TROUBLE * heard,
          f'{_percent(f.bad_outputs, heard)} of {y} is no finite number: check the sensor'),
         ('bad references', warn, f.bad_references > 0, f'{f.bad_references} {y_m} messages '
          'lately were no finite number: the last good one holds'),
         ('wraps', warn, f.wraps > 0,
          f'{y} jumps by 2 pi: it is an angle that wraps: let the driver count the turns'),
-        # Who else is there.
+        # Other nodes.
         ('rivals', error, f.standing_down,
          f'standing down: {(*rivals, "another node")[0]} published {v} before: stop one'),
         ('rivals', error, bool(rivals) and not f.standing_down,
@@ -280,7 +280,7 @@ def causes_of(f: LoopFigures) -> tuple[Row, ...]:
          f'{len(y.heard)} publishers of {y}, the first one is used: stop the others'),
         ('second reference', warn, len(y_m.heard) > 1,
          f'{y_m} is published by {", ".join(map(str, y_m.heard[:2]))}: stop all but one'),
-        # What does not come.
+        # Missing messages.
         ('silent', warn, f.silent_s > 0.0,
          f'no {y} for {f.silent_s:g} s: is the driver running? on_timeout: {f.on_timeout}'),
         ('waiting for output', warn, begins and heard == 0 and y.heard == y.peers,
@@ -289,7 +289,7 @@ def causes_of(f: LoopFigures) -> tuple[Row, ...]:
          and f.bad_references == 0 and y_m.heard == y_m.peers, waiting(y_m, 'start one')),
         ('unheard', warn, f.silent_s == 0.0 and not begins and not v.peers,
          f'nobody listens to {v}: is it the name that the driver uses?'),
-        # When it comes.
+        # Timing.
         ('rate', warn, isfinite(rate), f'{y} comes at {rate:.4g} Hz, sample_period is '
          f'{period_s:g} s ({1.0 / period_s:.4g} Hz): '
          + ('is the driver held up?' if timing.is_stretched else 'correct one of them')),
@@ -306,7 +306,7 @@ def causes_of(f: LoopFigures) -> tuple[Row, ...]:
          f'{_percent(f.lost - f.unsent, due)} of {y} was lost on its way: check the network'),
         ('reference silent', warn, 0.0 < f.reference_silent_s < inf, f'no {y_m} for more than '
          f'{f.reference_silent_s:g} s, the last one is held: publish it every sample'),
-        # What becomes of v.
+        # The effect of v, and the fits.
         ('still', warn, stands_still,
          f'{y} stands still while v swings over {f.v_swing:.3g}'
          + (f' ({f.v_swing / f.gap:.3g} gaps)' if f.gap > 0.0 else '')
@@ -325,21 +325,21 @@ def causes_of(f: LoopFigures) -> tuple[Row, ...]:
 
 
 def state_beside(causes: set[str], f: LoopFigures) -> Finding:
-    """How the learning goes where causes of these kinds were found: the first row that holds."""
+    """Return the finding about learning, beside causes of these kinds: the first row that holds."""
     ok, warn, error = Level
     y, (status, law, inconsistent_s, adapting, given) = f.around.output, f.learning
     share = 100.0 * law.unexplained
     name, value, (low, high) = law.forbidden or OutOfBounds('', nan, (nan, nan))
-    # Neither rate nor lateness turns a sign.
+    # Neither a wrong rate nor lateness can flip a sign.
     held = status == Status.INCONSISTENT and not law.wrong_sign
-    # Where a tenth is late or lost nobody can tell what else is wrong; nor for some seconds else.
+    # If a tenth is late or lost, other faults cannot be told; if less, not for some seconds.
     many = f.late + f.lost > 0.1 * (f.heard + f.lost)
     late = not causes.isdisjoint(LATE_KINDS) and (many or inconsistent_s < 3.0)
     return _findings((
         ('held', warn, held and ('rate' in causes or late), f'{y} does not follow from v '
          + ('at this rate' if 'rate' in causes else 'while samples are late or lost')
          + ': estimates held'),
-        # What is not there yet is among the causes; else all is about to begin.
+        # If something is missing, that is among the causes; else the loop is about to begin.
         ('begins', ok, status is None, 'the loop begins'),
         ('given', ok, given and status == Status.TRACKING,
          'estimates as given: estimator.law fixed learns nothing'),

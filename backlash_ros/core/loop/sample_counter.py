@@ -1,4 +1,4 @@
-"""Which sample a message holds, what was skipped, when a driver samples, when y_m leaves."""
+"""Counts samples by message and stamp, learns the period of a driver, and paces a reference."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -8,14 +8,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-# Share by which a period has to be off to be taken for another one than that of the model.
+# Relative deviation from which on a period is taken to differ from that of the model.
 OTHER_PERIOD = 0.003
-# What the middleware reports where it does not number messages.
+# Sequence number that the middleware reports if it does not number messages.
 UNNUMBERED = 2**64 - 1
-# A stamp never comes before its sample, so a missing one shows as a full period of lateness.
-# Jitter of the sender up to this share of a period is not taken for a loss.
+# A stamp is never earlier than its sample, so a missing sample shows as a full period of lateness.
+# Jitter of the sender up to this fraction of a period is not taken for a loss.
 JITTER = 0.85
-CLOCK_SLACK = 0.01  # share of a period by which the sender's clock may run slow per sample
+CLOCK_SLACK = 0.01  # fraction of a period by which the sender's clock may run slow per sample
 
 
 class Period(NamedTuple):
@@ -26,17 +26,17 @@ class Period(NamedTuple):
     median: float = nan
 
     def differs_from(self, nominal_s: float, tolerance: float) -> bool:
-        """Whether it certainly is off by more than a share, and the median interval likewise."""
+        """Whether the mean is certainly off by more than a relative tolerance, like the median."""
         off = self.mean - nominal_s
         return abs(off) > tolerance * nominal_s + 3.0 * self.std \
             and (self.median - nominal_s) * off > 0.5 * tolerance * nominal_s * abs(off)
 
 
 class Timing(NamedTuple):
-    """What is known of when y comes; nan where it is not. nominal_s: the period of the model.
+    """Timing of y; nan where it is not known. nominal_s: the period of the model.
 
-    intervals_s: low, mean and high of the newest ones between messages, of which a tenth is shorter
-    and a tenth longer. age_s: median time from stamp to arrival. repeats_stamps: the driver does.
+    intervals_s: first decile, mean and last decile of the newest intervals between messages. age_s:
+    median time from stamp to arrival. repeats_stamps: whether the driver repeats its stamps.
     """
 
     nominal_s: float
@@ -47,19 +47,19 @@ class Timing(NamedTuple):
 
     @property
     def is_stretched(self) -> bool:
-        """Whether pauses make the period longer, as the median interval is not."""
+        """Whether pauses make the mean period longer while the median interval is not."""
         mean, std, _ = self.period
         return mean - self.nominal_s > 0.01 * self.nominal_s + 3.0 * std \
             and not self.period.differs_from(self.nominal_s, 0.01)
 
     @property
     def rate(self) -> float:
-        """The rate of y [Hz] where it is not that of the model, else nan.
+        """The rate of y [Hz] if it differs from that of the model, else nan.
 
-        Where the period is not known, only if nearly all intervals are off to the same side by a
-        tenth: losses and stalls lengthen some of them, messages sent twice shorten some.
+        While the period is not known, nearly all intervals must be off to the same side by a tenth:
+        losses and stalls lengthen only some of them, and repeated messages shorten only some.
         """
-        # From 0.5 % on, less what is not known of the period after a second.
+        # From 0.5 % on, minus the uncertainty of the period after a second.
         if self.period.differs_from(self.nominal_s, 0.0045) or self.is_stretched:
             return 1.0 / self.period.mean
         low, mean, high = self.intervals_s
@@ -68,8 +68,8 @@ class Timing(NamedTuple):
 
 
 class DriverPeriod:
-    """Learns the period of a driver [s] from stamps [ns]; period_ns: to count with. came_early:
-    whether a sample was counted that came before it was due."""
+    """Learns the period of a driver from its stamps [ns]. period_ns: the one to count with.
+    came_early: whether a sample has been counted that came before it was due."""
 
     def __init__(self, nominal_s: float) -> None:
         self.nominal_s, self.period_ns = nominal_s, 1e9 * nominal_s
@@ -79,7 +79,7 @@ class DriverPeriod:
         self._since_learned, self.came_early = 0, False  # samples
 
     def hear(self, stamp_ns: int, received_ns: int) -> None:
-        """Take in any message of y: when it left and when it came, 0 where nobody tells."""
+        """Take in any message of y: its stamp, and when it was received (0 if unknown)."""
         self._messages_ns.append(stamp_ns)
         if received_ns > 0:
             self._ages_s.append((received_ns - stamp_ns) * 1e-9)
@@ -89,13 +89,13 @@ class DriverPeriod:
         self._since_learned += 1
 
     def restart(self, stamp_ns: int) -> None:
-        """Begin anew with this sample: the clock of the stamps is another one."""
+        """Begin anew with this sample: the clock of the stamps has changed."""
         self._samples_ns.clear()
         self._samples_ns.append(stamp_ns)
         self._since_learned, self.came_early, self.period_ns = 0, False, 1e9 * self.nominal_s
 
     def learn(self) -> None:
-        """Learn the period to count with, if it is time: for whenever nothing waits for it."""
+        """Update the period to count with if it is time; best called when nothing waits for it."""
         if self._since_learned < 20:
             return
         self._since_learned = 0
@@ -104,9 +104,9 @@ class DriverPeriod:
         if not is_other and len(stamps) > intervals:
             periods = (stamps[-1] - stamps[-1 - intervals]) / self.period_ns
             if abs(periods - intervals) < OTHER_PERIOD * intervals:
-                return  # as nearly always: what follows takes as long as a command
+                return  # as nearly always; what follows takes as long as computing a command
         found = self.newest(intervals)
-        # Once another one was certain, what is likely suffices.
+        # Once another period was certain, a likely one suffices.
         if isfinite(found.mean) and (is_other or found.differs_from(nominal_s, OTHER_PERIOD)):
             off = abs(found.mean - nominal_s) > OTHER_PERIOD * nominal_s
             self.period_ns = 1e9 * (found.mean if off else nominal_s)
@@ -120,42 +120,42 @@ class DriverPeriod:
         return Timing(self.nominal_s, self.newest(), shares, age_s)
 
     def newest(self, intervals: int = 1000) -> Period:
-        """The period over so many intervals at most: the slope of the stamps over their samples.
+        """Return the period over so many intervals at most: the slope of stamps over samples.
 
-        Known to some 0.1 % after a second, whatever was lost or came twice; unknown where most
-        intervals are no period at all, or scatter widely.
+        It is known to some 0.1 % after a second, despite losses and repetitions, and unknown if
+        most intervals are far from one period, or scatter widely.
         """
         stamps = list(islice(reversed(self._samples_ns), intervals + 1))[::-1]
         if len(stamps) <= 20:
             return Period()
         times = 1e-9 * np.array([stamp - stamps[-1] for stamp in stamps])
-        # Those of 2 s, 20 intervals at least.
+        # Those of the last 2 s, but 20 intervals at least.
         times = times[min(int(np.count_nonzero(times < -2.0)), len(times) - 21):]
         ordered, nominal_s = np.sort(np.diff(times)), self.nominal_s
         quarter = len(ordered) // 4
         typical = float(ordered[quarter:-quarter].mean())
         if not abs(typical / nominal_s - 1.0) < 0.25:
             return Period()
-        apart = 1 + len(times) // 300  # neighbours tell the same
+        apart = 1 + len(times) // 300  # neighbours add little information
         times = times[::apart]
         numbers = np.array(numbered(times.tolist(), typical))
         n, t = numbers - numbers.mean(), times - times.mean()
         spread = float(n @ n)
         slope = float(n @ t) / spread if spread else nan
         rest = float(np.mean((t - slope * n) ** 2))
-        # Beyond such a scatter, as of a driver that is held up all the time, nobody can tell from
-        # the stamps which samples were left out.
+        # With more scatter, as of a driver that is held up all the time, the stamps do not show
+        # which samples were left out.
         if not (slope > 0.0 and sqrt(rest) < 0.2 * nominal_s):
             return Period()
-        # A process that is held up is late for some ten samples, whose lateness is one error.
+        # A process that is held up is late for some ten samples in a row: that is a single error.
         std = sqrt(max(10.0 / apart, 1.0) * rest / spread)
         return Period(slope, std, float(ordered[len(ordered) // 2]))
 
 
 def numbered(times: Sequence[float], period_s: float, early: float = 0.3) -> list[float]:
-    """The number of each sample: stamps come late, by less than a period, but hardly early.
+    """Return the number of each sample, for stamps that are less than a period late.
 
-    early: share of a period by which one may come before it is due.
+    early: fraction of a period by which a stamp may be early.
     """
     number, numbers, due = 0.0, [0.0], times[0]
     for time in times[1:]:
@@ -170,7 +170,7 @@ def numbered(times: Sequence[float], period_s: float, early: float = 0.3) -> lis
 class Output(NamedTuple):
     """A measured y, when it was sampled, sent and received [ns], and the number of its message.
 
-    numbered: whether each number is a sample; else they only tell one sender from another.
+    numbered: whether the numbers count samples; else they only tell one sender from another.
     """
 
     y: float
@@ -186,10 +186,10 @@ class Output(NamedTuple):
 
 
 class Arrival(NamedTuple):
-    """What a message is; is_sample: no repetition, flood, old message or second sender.
+    """How a message counts. is_sample: False for a repeated, early, old or another sender's one.
 
-    missing: samples that never came before it. unsent: those of them that the sender has not
-    numbered. restarted: sender or clock did: nobody knows what the plant did in between.
+    missing: samples before it that never came. unsent: those of them that the sender has not
+    numbered. restarted: whether sender or clock has restarted, so that the plant state is unknown.
     """
 
     is_sample: bool = True
@@ -202,12 +202,12 @@ NO_SAMPLE, NEXT_SAMPLE = Arrival(is_sample=False), Arrival()
 
 
 class SampleCounter:
-    """Counts samples by two witnesses, number and stamp, of which the larger count is believed.
+    """Counts samples both by message number and by stamp, and believes the larger count.
 
-    Stamps tell besides what was never published, or lost by a relay that renumbers; a sender that
-    keeps no time is counted by number alone unless it is late. index: of the newest sample, -1
-    before any. due_ns: when that was due. from_zero: the first index is the number of its message
-    less 1, or 0; else its time in periods, so that who is restarted uses no index twice.
+    Stamps also show samples that were never published, or lost by a relay that renumbers; a sender
+    that keeps no time is counted by number alone unless it is late. index: of the newest sample, -1
+    before any. due_ns: when that was due. from_zero: whether the first index is the number of its
+    message less 1, or 0; else it is its time in periods, so that a restart reuses no index.
     """
 
     def __init__(self, sample_period_s: float, from_zero: bool = True) -> None:
@@ -215,22 +215,22 @@ class SampleCounter:
         self.sender = DriverPeriod(sample_period_s)
         self._from_zero = from_zero
         self._stamp_ns = self._sequence = 0  # of the newest sample
-        self._repeated = 0  # number of the newest message that followed it too early to be one
+        self._repeated = 0  # number of the newest message that came too early to be a sample
         self._early_ns = 0.0  # the earliest time at which the newest sample may have been due
-        self._lateness_ns: deque[float] = deque(maxlen=20)  # before any shift
+        self._lateness_ns: deque[float] = deque(maxlen=20)  # of the newest samples, unshifted
         self._shifted_ns = 0.0  # by how much due_ns was shifted so far
-        self._on_time = 0  # samples that came when they were due, less the early ones
+        self._on_time = 0  # samples on time, minus twice the early ones
         self._strange = 0  # messages in a row that do not follow the newest sample
 
     def count(self, stamp_ns: int, sequence: int = UNNUMBERED, numbered: bool = True,
               received_ns: int = 0) -> Arrival:
-        """Take in a message and say what it is; the arguments are those of Output."""
+        """Take in a message and return how it counts; the arguments are those of Output."""
         known = sequence != UNNUMBERED
         numbered = numbered and known
         self.sender.hear(stamp_ns, received_ns)
         self.sender.learn()
         period = self.sender.period_ns
-        keeps_time = self._on_time >= 20  # so what comes much too early is refused
+        keeps_time = self._on_time >= 20  # then a message that is much too early is refused
         if self.index < 0:
             self.index = round(stamp_ns / period) if not self._from_zero \
                 else max(sequence - 1, 0) if numbered else 0
@@ -249,14 +249,14 @@ class SampleCounter:
                 silent = stamp_ns - self._stamp_ns > 3.0 * period
                 if keeps_time and not silent:
                     return NO_SAMPLE
-                # Two senders in turn must not each look like one that restarted.
+                # Two senders that alternate must not look like one that restarts all the time.
                 return self._of_another(stamp_ns, sequence, by_time, silent and not keeps_time)
             if not numbered and is_early and skipped > 0:
                 return NO_SAMPLE  # of another sender
             # Numbers may jump some samples further than time has passed.
             if numbered and keeps_time and skipped > late + 4.0:
-                # A second sender, or a flood of which the middleware has dropped a part: for a
-                # while a message that fits is waited for.
+                # A second sender, or a flood of which the middleware has dropped a part: wait a
+                # while for a message that fits.
                 if late < 1.5:
                     return NO_SAMPLE
                 skipped = by_time
@@ -266,11 +266,11 @@ class SampleCounter:
             return NO_SAMPLE
         missing = max(by_time, skipped) if numbered else by_time
         if missing == 0 and not keeps_time:
-            # One that came early outweighs two that were due.
+            # An early one cancels two that were on time.
             self._on_time = max(self._on_time + (-2 if is_early else 1), 0)
             self.sender.came_early |= is_early
             if self.sender.came_early and self._on_time == 20:
-                # It keeps time: those that came early were none, and the count until now is wrong.
+                # It keeps time: the early ones were no samples, and the count so far is wrong.
                 arrival = self._of_another(stamp_ns, sequence, at_once=True)
                 self._on_time = 20
                 return arrival
@@ -289,19 +289,19 @@ class SampleCounter:
         late = stamp_ns - expected
         latenesses.append(late + self._shifted_ns)
         shift = min(late, period * CLOCK_SLACK)
-        # Where so many in a row all came later than expected, the sender has paused, and the least
+        # If so many in a row all came later than expected, the sender has paused, and the least
         # lateness among them is its new phase.
         if shift > 0.0 and len(latenesses) >= window:
             shift = max(shift, min(islice(reversed(latenesses), window)) - self._shifted_ns)
         self._shifted_ns += shift
         self.due_ns = expected + shift
-        # Who was held up for some samples comes back to the old phase: this one lags behind.
+        # A sender that was held up for some samples returns to its old phase: this one lags behind.
         early = self._early_ns + period * (1 + missing + CLOCK_SLACK)
         self._early_ns = max(min(early, stamp_ns), self.due_ns - 0.5 * period)
 
     def _of_another(self, stamp_ns: int, sequence: int, missing: int = 0,
                     at_once: bool = False) -> Arrival:
-        """Another sender, or a clock that was set back: mostly believed after some messages."""
+        """Restart with another sender, or a clock that was set back, if seen for long enough."""
         self._strange += 1
         if self._strange < 5 and not at_once:
             return NO_SAMPLE
@@ -319,26 +319,25 @@ class SampleCounter:
 
 
 def kept_outputs(sample_period: float) -> int:
-    """How many outputs wait for a controller that is held up, which learns from all of them."""
+    """Number of outputs that are kept for a controller that is held up, to learn from later."""
     return round(max(0.1 / sample_period, 20))
 
 
 class ReferencePace:
-    """Says at any time which sample of y_m is to leave now, if any; times are on a steady clock
-    [s].
+    """Decides which sample of y_m is to be sent now, if any; all times are on a steady clock [s].
 
     y_m(k+1) leaves half a period after y(k) was due, or as soon as a late y(k) is there; without
-    outputs it goes on by the own clock. At most one leaves per period, and none for the same sample
-    twice once the first output has come. waits: y_m(0) is repeated until then. own_clock: False on
-    simulated time, which may run at any speed: the newest y_m is repeated. due_s: when to look for
-    an output, and to wait for one if none is there.
+    outputs the node's own clock sets the pace. At most one leaves per period, and no sample twice
+    once the first output has come. waits: whether y_m(0) is repeated until then. own_clock: False
+    on simulated time, which may run at any speed: then the newest y_m is repeated. due_s: when to
+    look for an output, and to wait for one if there is none.
     """
 
     def __init__(self, period_s: float, waits: bool, now_s: float, own_clock: bool = True) -> None:
         self.waits, self._period_s, self._own_clock = waits, period_s, own_clock
         self._fresh = False  # an output that is not answered yet
         self._heard_s = -inf  # when the newest output came
-        self._offset = 0  # sample of y_m that follows the newest output, less its index
+        self._offset = 0  # sample of y_m that follows the newest output, minus the index of that
         self._next = 0  # sample that follows the newest output
         self._sent = -1
         self.due_s = now_s
@@ -346,13 +345,13 @@ class ReferencePace:
     def hear(self, index: int, at_s: float) -> None:
         if self._heard_s == -inf:
             self._offset = 1 if self.waits else self._next - index
-        # Where the own clock has run ahead, y_m does not go back.
+        # If the own clock has run ahead, y_m does not go back.
         self._offset = max(self._offset, self._sent - index)
         self._next = index + self._offset
         self._fresh, self._heard_s, self.waits = True, at_s, False
 
     def sample_to_send(self, now_s: float) -> int | None:
-        """The sample whose y_m has to leave now; None where it is not time yet."""
+        """Return the sample whose y_m is to leave now, or None if it is not time yet."""
         period, sample = self._period_s, self._next
         if now_s < self.due_s:
             return None

@@ -60,7 +60,7 @@ class Tracking(ControlStructure):
     def may_change(self) -> bool:
         """Whether v neither crosses the gap nor is about to."""
         # Samples after the first estimate, until v has crossed the gap with it; after a crossing,
-        # until its last moves are over; ahead, in which u* must not turn or make v hurry.
+        # until its last moves are over; ahead, in which u* must not turn or speed v up.
         settled_after, engaged_after, foreseen = 150, 5, 6
         trust, plan = self.feedback.trust, self.trajectory
         if trust.in_use_for < settled_after or self._engaged_for < engaged_after:
