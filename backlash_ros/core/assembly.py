@@ -1,4 +1,4 @@
-"""From checked parameters to the objects of the core: the one place that knows both."""
+"""Builds the objects of the core from checked parameters: the only module that knows both."""
 
 from dataclasses import replace
 from functools import lru_cache
@@ -37,7 +37,7 @@ from backlash_ros.core.scenario import (
 
 __all__ = ['build_model', 'build_plant', 'build_reference', 'build_true_model']  # and its own
 
-# What a process imports that makes fits and gains.
+# Modules that a worker process needs for fits and gains.
 WORKER_MODULES = (fitted.__module__, better_design.__module__)
 LAWS = tuple(dict.fromkeys(BY_NAME['estimator.law'].choices.values()))
 STRUCTURES = tuple(BY_NAME['structure'].choices)
@@ -54,10 +54,10 @@ def law_fits(law: str, structure: str) -> bool:
 
 def build_controller(p: Parameters, estimate: Estimate | None = None,
                      executor: Executor | None = None) -> AdaptiveController:
-    """The controller with the law and the structure that the parameters name.
+    """Return the controller with the law and the structure that the parameters name.
 
-    estimate: to begin with, None for those that were known before. executor: where fits and gains
-    are made, None for here. Raises ParameterError for parameters that contradict each other.
+    estimate: to begin with; None: known_before(p). executor: computes fits and gains; None: in this
+    process. Raises ParameterError for parameters that contradict each other.
     """
     check_model(build_model(p))
     _check_estimates(p)
@@ -87,14 +87,14 @@ def _build_law(p: Parameters, initial: Estimate, executor: Executor) -> Law:
         return MovingHorizon(initial, bounds, model, p, observer, executor)
     if options.law == 'fixed':
         return FixedBacklash(initial, model, noise_std, p.fixed.doubt)
-    # The others take c_l < 0 < c_r for granted, unless they are told otherwise.
+    # The other laws assume c_l < 0 < c_r, unless the bounds exclude that.
     (low_r, high_r), (low_l, high_l) = bounds.c_r, bounds.c_l
     bounds = Bounds(bounds.m, (max(low_r, 0.0) if high_r > 0.0 else low_r, high_r),
                     (low_l, min(high_l, 0.0) if low_l < 0.0 else high_l))
     if options.law == 'gradient':
         return GradientEstimator(
             initial, bounds, build_four_blocks(p), p.gradient.step, noise_std)
-    # A law averages over the noise of u by itself, but not over the bias of smoothing it away.
+    # A law itself averages out the noise of u, but not the bias that smoothing would add.
     reconstruction = InputReconstruction(build_model(p), noise_std, options.lag, smoothed=0.1)
     common = initial, bounds, p.proportional.bounds, reconstruction
     if options.law == 'printed':
@@ -112,7 +112,7 @@ def build_structure(p: Parameters) -> ControlStructure:
 
 
 def build_four_blocks(p: Parameters) -> FourBlocks:
-    """The gains of `pole_placement`, placed where those of `tracking` put the poles of G."""
+    """Return gains of `pole_placement` for the poles that state feedback of `tracking` gives."""
     state = build_state_model(p, commanded=True)
     gains = feedback_around(state, p.tracking._replace(integral_weight=0.0))
     closed = np.real(np.poly(state.a - np.outer(state.b, gains.state)))
@@ -120,33 +120,33 @@ def build_four_blocks(p: Parameters) -> FourBlocks:
 
 
 def build_limits(p: Parameters) -> Limits:
-    """Limits of v per sample."""
+    """Return the limits of v per sample."""
     control, period = p.control, p.sample_period
     return Limits(control.min, control.max, control.rate_max * period,
                   control.acceleration_max * period**2)
 
 
 def build_state_model(p: Parameters, commanded: bool = False) -> StateModel:
-    """The state space of G(z), or of L(z) G(z) from the command to y; the same one for the same."""
+    """Return the state space of G(z), or, commanded, of L(z) G(z) from the command to y."""
     model, actuator = build_model(p), build_actuator(p)
     if commanded and actuator is not None:
         model = actuator.in_front_of(model)
     return _state_model(tuple(model.numerator), tuple(model.denominator))
 
 
-# Remembered: a controller that restarts does so in the middle of a loop.
+# Cached, as a controller that restarts does so in the middle of a loop.
 @lru_cache(maxsize=16)
 def _state_model(numerator: tuple[float, ...], denominator: tuple[float, ...]) -> StateModel:
     return StateModel(TransferFunction(numerator, denominator))
 
 
 def first_guess(p: Parameters) -> Estimate:
-    """The estimates that estimator.initial names."""
+    """Return the estimate that estimator.initial and proportional.f name."""
     return Estimate(*p.estimator.initial, p.proportional.f)
 
 
 def known_before(p: Parameters) -> Estimate:
-    """The estimates to begin with: those in estimates.file if they are to be loaded and there."""
+    """Return the estimate to begin with: that of estimates.file if loaded, else first_guess(p)."""
     return load_estimate(p) or first_guess(p)
 
 
@@ -157,12 +157,12 @@ def takes_model_as_exact(p: Parameters) -> bool:
 
 
 def warnings_of(p: Parameters, with_reference: bool = True) -> list[str]:
-    """What is allowed but makes the estimate hard; with_reference: that of p is in use."""
+    """Return warnings of what makes the estimate hard; with_reference: whether p's is in use."""
     return model_warnings(build_model(p), p.sample_period, p.frequency if with_reference else None)
 
 
 def _check_estimates(p: Parameters) -> None:
-    """Raise ParameterError where first guesses and bounds contradict each other."""
+    """Raise ParameterError if first guesses and bounds contradict each other."""
     initial, bounds = p.estimator.initial, p.estimator.bounds
     for name, (low, high), value in zip(bounds._fields, bounds, initial, strict=True):
         if low >= high:

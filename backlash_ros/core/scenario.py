@@ -1,6 +1,6 @@
-"""From checked parameters to what a controller meets: G(z), the simulated plant, y_m.
+"""Builds the surroundings of a controller from checked parameters: G(z), simulated plant, y_m.
 
-Apart from assembly.py, so that the nodes for these start without loading what learns and controls.
+Apart from assembly.py, so that the nodes for these start without loading laws and controllers.
 """
 
 import csv
@@ -13,31 +13,31 @@ from backlash_ros.core.plant.actuator import Actuator
 from backlash_ros.core.plant.simulated_plant import SimulatedPlant, altered_plant, delayed
 from backlash_ros.core.plant.transfer_function import TransferFunction
 
-# Shapes of the phase alone, which go on where they are if the frequency changes.
+# Functions of the phase alone, which continue without a jump if the frequency changes.
 PERIODIC: Mapping[str, Callable[[float], float]] = {
     'sine': sin,
     'square': lambda phase: 1.0 if phase % (2.0 * pi) < pi else -1.0,
     'triangle': lambda phase: 2.0 / pi * asin(max(-1.0, min(1.0, sin(phase)))),
-    # Schroeder's phases keep the crest low.
+    # Schroeder phases keep the crest factor low.
     'multisine': lambda phase: sum(
         sin(h * phase - pi * i * (i + 1) / 4) for i, h in enumerate((1, 2, 3, 5))) / 4,
 }
 
 
 def build_model(p: Parameters) -> TransferFunction:
-    """G(z), and the delay between control and its effect as poles at 0."""
+    """Return G(z), with the delay between control and its effect as poles at 0."""
     delay = (0.0,) * p.control.delay_samples
     return TransferFunction(p.plant.numerator, p.plant.denominator + delay)
 
 
 def build_actuator(p: Parameters) -> Actuator | None:
-    """What lies between control and applied_control; None where nothing does."""
+    """Return the actuator between control and applied_control, or None if there is none."""
     lag = p.actuator.numerator, p.actuator.denominator
     return Actuator(TransferFunction(*lag, 'actuator'), p.actuator.wind_up) if any(lag) else None
 
 
 def build_true_model(p: Parameters) -> TransferFunction:
-    """G(z) of the simulated plant, which truth.* may set apart from the one that is known."""
+    """Return G(z) of the simulated plant, which truth.* may make differ from the known one."""
     truth, plant = p.truth, p.plant
     base = TransferFunction(
         truth.numerator or plant.numerator, truth.denominator or plant.denominator,
@@ -49,16 +49,16 @@ def build_true_model(p: Parameters) -> TransferFunction:
 
 
 def build_plant(p: Parameters) -> SimulatedPlant:
-    """The simulated plant with its hidden backlash."""
+    """Return the simulated plant with its hidden backlash."""
     return SimulatedPlant(p, build_true_model(p), build_actuator(p))
 
 
 class ReferenceSignal:
     """y_m(t) = bias + amplitude * shape(t), by the parameters of the reference.
 
-    frequency [rad/s]; a step rises after half a period; chirp: from frequency_start to frequency
-    within sweep_time [s], linear, and again. samples: for waveform: file instead of those of the
-    file, one per sample period, the last one held. Raises ParameterError.
+    frequency [rad/s]; a step rises after half a period; a chirp sweeps linearly from
+    frequency_start to frequency in sweep_time [s], again and again. samples: instead of those of
+    the file for waveform: file, one per sample period, the last one held. Raises ParameterError.
     """
 
     def __init__(self, p: Parameters, samples: tuple[float, ...] = ()) -> None:
@@ -66,7 +66,7 @@ class ReferenceSignal:
         self._samples = samples or (_samples_of_file(p) if p.waveform == 'file' else ())
 
     def __call__(self, t: float) -> float:
-        """y_m at time t >= 0 [s]."""
+        """Return y_m at time t >= 0 [s]."""
         return self._p.bias + self._p.amplitude * self._shape(t)
 
     def _shape(self, t: float) -> float:
@@ -88,7 +88,7 @@ build_reference = ReferenceSignal
 
 
 def _samples_of_file(p: Parameters) -> tuple[float, ...]:
-    """Values of the CSV with header t,y_m and a row per sample period."""
+    """Read the values of the CSV with header t,y_m and a row per sample period."""
     if not p.file:
         raise ParameterError('file', '', 'must name a CSV with rows t,y_m for waveform: file')
     try:
@@ -107,7 +107,7 @@ def _samples_of_file(p: Parameters) -> tuple[float, ...]:
             t, y_m = map(float, row)
         except ValueError:
             t = y_m = nan
-        # A file in decimals rounds a little away.
+        # Decimal times in a file are rounded.
         if not (abs(t - due) <= 1e-3 * p.sample_period and isfinite(y_m)):
             raise ParameterError(
                 'file', p.file, f'line {line} must hold t={due:.9g} and a finite y_m',

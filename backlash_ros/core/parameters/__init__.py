@@ -41,8 +41,8 @@ __all__ = [
 class Parameters(ParameterTree, Mapping[str, Value]):
     """Values by group, `p.control.max`, and by flat name, `p['control.max']`.
 
-    joint_names: of the `joints`; a single loop without any is nameless. given: what is not left to
-    its default, as it was given.
+    joint_names: the `joints`, or one empty name for a single loop. given: the values that are not
+    left to their defaults, as they were given.
     """
 
     joint_names: tuple[str, ...]
@@ -71,7 +71,7 @@ class Parameters(ParameterTree, Mapping[str, Value]):
             for name, p in BY_NAME.items()
         }
         if NOISE not in shared:
-            # Whoever simulates noise means the estimator to know it, unless told otherwise.
+            # By default the estimator knows the noise that is simulated.
             checked[NOISE] = max(checked[NOISE], hypot(
                 checked['output_noise_std'], checked['output_quantum'] / sqrt(12.0)))
         vars(self).update(attributes_of(ParameterTree, checked))
@@ -91,7 +91,7 @@ class Parameters(ParameterTree, Mapping[str, Value]):
         return len(self._values)
 
     def replaced(self, changes: Mapping[str, object]) -> 'Parameters':
-        """A new set with some values changed, defaults staying defaults; raises ParameterError."""
+        """Return a new set with some values changed, defaults left open; raises ParameterError."""
         return Parameters({**self.given, **changes})
 
     @property
@@ -110,7 +110,7 @@ def check_names(names: Iterable[str], joints: Iterable[str] = ()) -> None:
 
 
 def entry_of(name: str) -> Parameter | None:
-    """What the table says of a declared parameter, that of one joint included."""
+    """Return the table entry of a parameter, or of one with a joint's name before it, or None."""
     return BY_NAME.get(name) or BY_NAME.get(name.partition('.')[2])
 
 
@@ -122,7 +122,7 @@ def _of_joint(joint: str, shared: Mapping[str, object], own: Mapping[str, object
                                  f'set {name}')
     values = {**shared, **own, 'io.joint': joint}
     del values['joints']
-    if 'plant.denominator' not in values:  # nobody has said what it is like: v = y_m
+    if 'plant.denominator' not in values:  # nothing is known of this joint: v = y_m
         values |= {
             'plant.numerator': (1.0,), 'plant.denominator': (1.0, 0.0), 'estimator.law': 'fixed',
             'structure': 'proportional', 'proportional.f': 0.0, 'estimator.initial.m': 1.0,

@@ -1,4 +1,4 @@
-"""What is declared of a parameter, and the check of a value against it."""
+"""Declaration of a parameter, and checks of values against it."""
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
@@ -9,7 +9,7 @@ from typing import Any, get_args, get_type_hints
 
 Value = bool | int | float | str | tuple[float, ...] | tuple[str, ...]
 
-UNTOLD = object()  # in place of a value that has nothing to do with the error
+UNTOLD = object()  # stands for a value that has nothing to do with the error
 
 
 class ParameterError(ValueError):
@@ -23,12 +23,12 @@ class ParameterError(ValueError):
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter. elements: the types of those of a list, with ... for any number of them.
+    """Declaration of a parameter. elements: types of the elements of a list, ... for any number.
 
-    low, high: bounds, of each element, which themselves are allowed; above: a bound that is not,
-    nan for none. choices: allowed words, each with what it stands for. used_by: executables that
-    read it. change: 'live' in a running node, in an 'unconfigured' controller, or 'never'.
-    per_node: a controller with several joints has it once.
+    low, high: inclusive bounds, of each element; above: an exclusive lower bound, nan for none.
+    choices: allowed words, each with what it stands for. used_by: executables that read it. change:
+    possible 'live' in a running node, in an 'unconfigured' controller, or 'never'. per_node:
+    whether a controller with several joints has it only once.
     """
 
     name: str
@@ -51,7 +51,7 @@ class Parameter:
 
     @property
     def length(self) -> int | None:
-        """How many elements a list must have, None for any."""
+        """Number of elements that a list must have, None for any number."""
         return None if not self.elements or ... in self.elements else len(self.elements)
 
     @property
@@ -68,9 +68,9 @@ class Parameter:
 
 def option(default: Any, description: str, unit: str = '', choices: Iterable[str] = (),
            **rules: Any) -> Any:
-    """What a group says of a parameter, in place of its default; rules: fields of Parameter.
+    """Declare a parameter where a group would have its default; rules: fields of Parameter.
 
-    choices: words; 'OLD=NEW' is one that stands for another.
+    choices: allowed words; 'OLD=NEW' is one that stands for another.
     """
     words = {word: meant or word for word, _, meant in (each.partition('=') for each in choices)}
     return partial(Parameter, default=default, description=description, unit=unit, choices=words,
@@ -92,7 +92,7 @@ def declared_in(group: type[Any], prefix: str = '') -> Iterator[Parameter]:
 
 def attributes_of(group: type[Any], values: Mapping[str, Value],
                   prefix: str = '') -> dict[str, Any]:
-    """Those of a group, from the values of its parameters by their names."""
+    """Return the attributes of a group, from the values of its parameters by name."""
     return {
         name: values[prefix + name] if prefix + name in values
         else kind(**attributes_of(kind, values, f'{prefix}{name}.'))
@@ -101,7 +101,7 @@ def attributes_of(group: type[Any], values: Mapping[str, Value],
 
 
 def as_yaml(value: Value) -> str:
-    """A value as it stands in a YAML file or after -p NAME:=."""
+    """Format a value for a YAML file, or for -p NAME:=."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, tuple):
@@ -121,7 +121,7 @@ def check_value(parameter: Parameter, value: object) -> Value:
     if isinstance(default, (bool, str)):
         words = ('true', 'false') if isinstance(default, bool) else tuple(parameter.choices)
         if 'true' in words and isinstance(value, (bool, str)):
-            value = str(value).lower()  # YAML and ROS 2 take true and false for more than words
+            value = str(value).lower()  # YAML and ROS 2 turn true and false into booleans
         if words and value not in words:
             raise refused(value, f'must be one of {", ".join(words)}')
         if not isinstance(value, str):
@@ -162,7 +162,7 @@ def _checked_list(parameter: Parameter, value: object) -> tuple[float, ...] | tu
 def _number(parameter: Parameter, value: Any) -> float:
     refused = partial(ParameterError, parameter.name)
     try:
-        # YAML 1.1 reads 1e-5 (no point, no sign) as a text, and tools of ROS 2 send .inf as one.
+        # YAML 1.1 reads 1e-5 (without a point) as a string, and ROS 2 tools send .inf as one.
         number = float(value.replace('.inf', 'inf') if isinstance(value, str) else value)
     except OverflowError:
         raise refused('...', 'is too large for a number') from None
@@ -172,7 +172,7 @@ def _number(parameter: Parameter, value: Any) -> float:
         raise refused(value, 'must be a number')
     if isnan(number) or not (isfinite(number) or parameter.infinite):
         raise refused(number, 'must be finite')
-    if isfinite(number) and abs(number) > 1e100:  # squares, and products of two, still are numbers
+    if isfinite(number) and abs(number) > 1e100:  # so that squares and products stay finite
         raise refused(number, 'must be within ±1e+100', 'choose another unit')
     if number <= parameter.above or not parameter.low <= number <= parameter.high:
         unit = f' [{parameter.unit}]' if parameter.unit else ''

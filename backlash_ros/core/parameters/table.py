@@ -12,7 +12,7 @@ from backlash_ros.core.parameters.parameter import Parameter, declared_in, optio
 
 CONTROLLER, PLANT, REFERENCE_NODE, RECORDER = 'controller', 'plant', 'reference', 'recorder'
 BRINGUP = 'bringup'
-# Whose names the sections of a parameter file have.
+# The sections of a parameter file have these names.
 NODES = (CONTROLLER, PLANT, REFERENCE_NODE, RECORDER, BRINGUP)
 NOISE = 'estimator.output_noise_std'
 

@@ -1,1 +1,1 @@
-"""B(.) and G(z): (2.1), transfer function and state space, and a plant (3.1) made of them."""
+"""Backlash (2.1), transfer function and state space of G(z), and the simulated plant (3.1)."""

@@ -1,9 +1,9 @@
-"""What a position loop in front of the backlash makes of the command.
+"""Model of a motor with a position loop in front of the backlash.
 
     q(k+1) = L(z) (command(k) - offset),   v = q - L(1) w while it pushes the load to the right
 
-v is where the motor is, as its encoder reports it at the end of an interval. Dry friction of the
-load winds the loop up by w before the load moves: until then v stays where it touched the load.
+v is the position of the motor, which its encoder reports at the end of an interval. Dry friction of
+the load winds the loop up by w before the load moves; until then v stays where it met the load.
 """
 
 from dataclasses import dataclass
@@ -17,9 +17,9 @@ from backlash_ros.core.plant.transfer_function import TransferFunction
 
 @dataclass(frozen=True)
 class Actuator:
-    """lag: L(z). wind_up: (right, left), by which the command has to go further [unit of v].
+    """lag: L(z). wind_up: (right, left), how much further the command has to go [unit of v].
 
-    Raises ParameterError for an L that is not stable or has no gain at rest.
+    Raises ParameterError if L is not stable or L(1) is not positive.
     """
 
     lag: TransferFunction
@@ -39,18 +39,18 @@ class Actuator:
 
     @property
     def gain(self) -> float:
-        """L(1)."""
+        """Gain at rest, L(1)."""
         return float(self.lag.numerator.sum() / self.lag.denominator.sum())
 
     def crossings(self, c_r: float, c_l: float) -> tuple[float, float]:
-        """Crossings for the command, of those behind the motor."""
+        """Convert the crossings of v, behind the motor, to those of the command."""
         right, left = self.wind_up
         return c_r / self.gain + right, c_l / self.gain - left
 
     def in_front_of(self, model: TransferFunction) -> TransferFunction:
-        """L(z) G(z) from the command to y.
+        """Return L(z) G(z), from the command to y.
 
-        G is that of a v that acts from its sample on, where L tells of the v at the end: z L G.
+        G expects the v of an interval at its beginning, and L gives it at the end: hence z L G.
         """
         numerator = np.convolve(np.trim_zeros(self.lag.numerator, 'f'), model.numerator)
         denominator = np.convolve(self.lag.denominator, model.denominator)
@@ -62,7 +62,7 @@ class Actuator:
 
 
 class Motor:
-    """Where the motor is, by the command alone. It begins at rest where the first command says."""
+    """Predicts the motor position from the command; begins at rest at the first command."""
 
     def __init__(self, actuator: Actuator) -> None:
         right, left = actuator.wind_up
@@ -71,7 +71,7 @@ class Motor:
         self._lag, self._x = actuator.lag, list[float]()
 
     def step(self, command: float, load: float, c_r: float, c_l: float) -> float:
-        """Go on by one sample; return v at the end of it. load: u / m, what the gap holds [v]."""
+        """Advance by one sample; return v at its end. load: u / m, position of the load [v]."""
         reached = command - self._offset
         if not self._x:
             a, b, _ = self._lag.state_space()

@@ -1,4 +1,4 @@
-"""Backlash, equation (2.1): play between an actuator and what it drives; also over a record.
+"""Backlash, equation (2.1): play between an actuator and its load, per sample or over a record.
 
 u = m (p - c_r) of a play p(k) = min(max(p(k-1), v(k)), v(k) + gap) with gap = c_r - c_l: p rests on
 v while the right side is engaged, and on v + gap while the left one is.
@@ -23,11 +23,11 @@ class Region(IntEnum):
     RIGHT = 1  # upward active: u = m (v - c_r)
 
 
-LEFT, GAP, RIGHT = Region  # by name in this module: a member of the class is slow to look up
+LEFT, GAP, RIGHT = Region  # names of the module, as looking up a member of the class is slow
 
 
 def clamp(held: float, low: float, high: float) -> float:
-    """What a play holds: the value before, moved by the wall that it meets, (2.1)."""
+    """Return the held value, pushed along by the bound that it meets: one step of (2.1)."""
     return low if held <= low else high if held >= high else held
 
 
@@ -55,10 +55,10 @@ class Backlash:
 
 
 def play(v: Array, gap: Array | float, before: Array | float) -> Array:
-    """p after each v (N,); before: p before the first. For gaps (H,) and beginnings (H,): (H, N).
+    """Return p after each v (N,); before: p before the first. For H gaps and befores: (H, N).
 
-    Between two turns of v, p is the larger of v and what was held, or the smaller of v + gap and
-    it: only the turns are stepped.
+    Between two turns of v, p is the larger of v and the held value, or the smaller of that and
+    v + gap: so only the turns are stepped through.
     """
     rises = np.append(False, v[1:] > v[:-1])
     turns = np.append(np.flatnonzero(rises[1:] != rises[:-1]), len(v) - 1)
@@ -75,13 +75,13 @@ def play(v: Array, gap: Array | float, before: Array | float) -> Array:
 
 
 def engaged(v: Array, p: Array, gap: float) -> Sides:
-    """The Region of the side that was engaged last at each sample (N,): GAP before the first."""
+    """Return the side that was engaged last at each sample (N,); GAP before any was."""
     now = np.where(p == v, Region.RIGHT, np.where(p == v + gap, Region.LEFT, Region.GAP))
     newest = np.maximum.accumulate(np.where(now != Region.GAP, np.arange(len(v)), -1))
     return np.where(newest < 0, Region.GAP, now[newest]).astype(np.int8)
 
 
 def reversals(sides: Sides) -> NDArray[np.intp]:
-    """Samples (R,) at which the other side engages."""
+    """Return the samples (R,) at which the other side engages."""
     seen = np.flatnonzero(sides)
     return np.asarray(seen[1:][np.diff(sides[seen]) != 0])

@@ -1,6 +1,6 @@
 """Filters and their fit, Riccati and Lyapunov equations, gains, pole placement, noise of a signal.
 
-scipy.signal takes a node 0.3 s of its start and 40 MB, scipy.linalg 31 MB: they are loaded late.
+lfilter is not that of scipy.signal, which costs 0.3 s and 40 MB; scipy.linalg (31 MB) loads late.
 Reference: E. K.-W. Chu et al., Structure-preserving algorithms for periodic discrete-time algebraic
 Riccati equations, Int. J. Control 77 (2004) 767-788.
 """
@@ -23,7 +23,7 @@ def lfilter(
     b: Sequence[float] | Array, a: Sequence[float] | Array, x: ArrayLike,
     state: ArrayLike | None = None,
 ) -> Array:
-    """y with a(z) y = b(z) x along the last axis.
+    """Return y of a(z) y = b(z) x along the last axis.
 
     b, a: coefficients in descending powers of z, from z^0 on. x: shape (..., N). state: of the
     filter before x, the zi of scipy.signal.lfilter, shape (..., max(len(a), len(b)) - 1).
@@ -49,12 +49,12 @@ def lfilter(
 
 
 def padded(x: Array, length: int) -> Array:
-    """The first values of x, and zeros behind them, (length,)."""
+    """Return x truncated to this length, or followed by zeros up to it."""
     return np.append(x, np.zeros(max(length - len(x), 0)))[:length]
 
 
 def shifted(x: Array, count: int) -> Array:
-    """x (..., N) by 0, 1, ... samples later, zeros before it, shape (..., count, N)."""
+    """Return x (..., N) delayed by 0, 1, ... samples, with zeros before it: (..., count, N)."""
     out = np.zeros((*x.shape[:-1], count, x.shape[-1]))
     for late in range(min(count, x.shape[-1])):
         out[..., late, late:] = x[..., :x.shape[-1] - late]
@@ -62,7 +62,7 @@ def shifted(x: Array, count: int) -> Array:
 
 
 def is_stable(a: list[float]) -> bool:
-    """Whether all poles lie within the unit circle, by Schur and Cohn: quicker than its roots."""
+    """Whether all roots lie within the unit circle: Schur-Cohn test, faster than finding them."""
     while len(a) > 1:
         k = a[-1] / a[0]
         if not abs(k) < 1.0:
@@ -74,12 +74,12 @@ def is_stable(a: list[float]) -> bool:
 def steiglitz_mcbride(
     y: Array, follows: Callable[[Array], Array], poles: int, rows: NDArray[Any], steps: int = 3,
 ) -> Iterator[tuple[Array, Array]]:
-    """A with so many poles, and weights (C,) of what A y (N,) follows, from two first filters.
+    """Yield A with so many poles and weights (C,) of A y = weights' inputs, from two first filters.
 
-    Least squares over these rows in A and weights, with y and all that it follows filtered by 1/A
-    of the step before. follows: that (C, N), filtered so, by A.
+    Each step is least squares over these rows, with y (N,) and the inputs filtered by 1/A of the
+    step before. follows: takes A and returns the inputs (C, N), filtered so.
     """
-    inside = 0.999  # where poles outside of the unit circle are put
+    inside = 0.999  # magnitude that poles beyond it are moved to
     for pole in (0.6, 0.95) if poles else (0.0,):
         a: Array = np.atleast_1d(np.poly([pole] * poles))
         for _ in range(steps if poles else 1):
@@ -96,16 +96,16 @@ def steiglitz_mcbride(
 
 
 def riccati(a: Array, b: Array, q: Array) -> Array:
-    """P = A'PA - A'PB (1 + B'PB)^-1 B'PA + Q, the stabilising one, shape (n, n).
+    """Return the stabilising P = A'PA - A'PB (1 + B'PB)^-1 B'PA + Q, shape (n, n).
 
     a: (n, n). b: (n,). q: (n, n), positive semidefinite. The gain (1 + B'PB)^-1 B'PA stabilises
-    (A, B); with (A', C') for them and Q of the noise P is the covariance of a Kalman filter.
-    Raises numpy.linalg.LinAlgError where there is none.
+    (A, B). With (A', C') and Q of the process noise, P is the covariance of a Kalman prediction.
+    Raises numpy.linalg.LinAlgError if there is none.
     """
     transition, g, p = a.copy(), np.outer(b, b), np.array(q, np.float64)
     unit = np.eye(len(a))
     with np.errstate(over='ignore', invalid='ignore'):
-        for _ in range(60):  # each time the solution covers twice as many samples
+        for _ in range(60):  # each step doubles the number of samples that P covers
             inner = np.linalg.solve(unit + g @ p, np.hstack([transition, g]))
             more = transition.T @ p @ inner[:, :len(a)]
             g += transition @ inner[:, len(a):] @ transition.T
@@ -119,23 +119,23 @@ def riccati(a: Array, b: Array, q: Array) -> Array:
 
 
 def lyapunov(a: Array, q: Array) -> Array:
-    """P = A P A' + Q for a stable A, shape (n, n); raises numpy.linalg.LinAlgError for another."""
+    """Return P = A P A' + Q, shape (n, n); raises numpy.linalg.LinAlgError if A is not stable."""
     return riccati(a.T, np.zeros(len(a)), q)
 
 
 class Gain(NamedTuple):
-    """Of the stationary Kalman filter, in units of the noise of y."""
+    """Gain and deviations of the stationary Kalman filter, in units of the noise on y."""
 
-    gain: tuple[float, ...]  # after a prediction, in the observer form
-    innovation: float  # its deviation
+    gain: tuple[float, ...]  # of the update after a prediction, in observer form
+    innovation: float  # standard deviation of the innovation
     cov: Array  # of the state in the coordinates of StateModel, (n, n)
-    quiet: float  # `innovation` with this gain, but with the next smaller noise on u
+    quiet: float  # `innovation` with this gain, but with a tenth of the noise on u
 
 
 @lru_cache(maxsize=64)
 def gain_of(model: StateModel, ratio: float) -> Gain:
-    """For white noise on u that moves y by `ratio` times the noise of y, where a period has 20
-    samples; a gain of 0 where there is none."""
+    """Return the gain for white noise on u that, at a period of 20 samples, moves y by `ratio`
+    times the noise on y; a gain of 0 if there is none."""
     n, transfer = model.order, model.transfer_function
     power = abs(transfer.response(np.array([np.exp(0.1j * np.pi)]))[0])
     noise = np.outer(model.b, model.b) * (ratio / power) ** 2
@@ -156,7 +156,7 @@ def gain_of(model: StateModel, ratio: float) -> Gain:
 
 
 class FourBlocks(NamedTuple):
-    """Gains of the four-block structure of Tao and Kokotović, and what they make of the loop.
+    """Gains of the four-block structure of Tao and Kokotović, and transfer functions of the loop.
 
         u_d = theta_1' w_1 + theta_2' w_2 + theta_20 y + theta_3 r
         w_1 = a(z)/Lambda(z) u_d,   w_2 = a(z)/Lambda(z) y,   a = (z^(n-2), ..., z, 1)'
@@ -177,15 +177,15 @@ class FourBlocks(NamedTuple):
 
 
 def place_poles(model: TransferFunction, closed: Array, filter_pole: float) -> FourBlocks:
-    """Gains for A_m = closed, shape (n + 1,) and monic, and Lambda = (z - filter_pole)^(n-1).
+    """Return gains for A_m = closed, monic (n + 1,), and Lambda = (z - filter_pole)^(n-1).
 
     With G = B/A, S = Lambda - theta_1' a and R = theta_2' a + theta_20 Lambda they solve
 
         A S - B R = Lambda A_m
 
     so that y = theta_3 B/A_m r + W (u - u_d) with W = B S/(Lambda A_m), and no zero of G is
-    cancelled. theta_3 gives unit gain at z = 1. Raises ParameterError where numerator and
-    denominator of G have a common factor or nearly so, or G has a zero at z = 1.
+    cancelled. theta_3 gives unit gain at z = 1. Raises ParameterError if numerator and denominator
+    of G have a common factor, or nearly so, or if G has a zero at z = 1.
     """
     n, a, b = model.order, model.denominator, model.numerator[1:]
     placed = np.atleast_1d(np.poly(np.full(n - 1, filter_pole)))
@@ -219,9 +219,9 @@ def place_poles(model: TransferFunction, closed: Array, filter_pole: float) -> F
 class NoiseLevel:
     """Standard deviation of the white noise in a signal that moves slowly, or in jumps.
 
-    The noise is what the sixth differences show: motion, even with 30 samples per period, leaves
-    1e-4 of its amplitude there. They are sqrt(924) times the noise; the median of the size of a
-    normal variable is 0.6745 of its deviation.
+    It is taken from sixth differences, in which motion, even with 30 samples per period, leaves
+    1e-4 of its amplitude. They have sqrt(924) times the standard deviation of the noise; the median
+    magnitude of a normal variable is 0.6745 of its standard deviation.
     """
 
     def __init__(self) -> None:
@@ -231,7 +231,7 @@ class NoiseLevel:
 
     @property
     def std(self) -> float:
-        """0 until enough has been seen."""
+        """The estimate; 0 until there are 15 differences."""
         count = len(self._sorted)
         return 1.0 / (924.0**0.5 * 0.6745) * self._sorted[count // 2] if count >= 15 else 0.0
 
@@ -249,8 +249,8 @@ class NoiseLevel:
 
 def isolated(flags: NDArray[np.bool_], known: NDArray[np.intp], most: float, run: int) -> \
         NDArray[np.bool_]:
-    """Flags (N,) but for runs of so many of the samples that are known (K,); none at all where they
-    are more than a share of these."""
+    """Return flags (N,) without runs of `run` or more of the known samples (K,); none at all if
+    there are more flags than the fraction `most` of these."""
     out: NDArray[np.bool_] = flags & (flags.sum() <= most * len(known))
     edges = np.flatnonzero(np.diff(np.concatenate([[0], out[known].astype(int), [0]])))
     for begin, end in zip(edges[::2], edges[1::2], strict=True):
@@ -260,5 +260,5 @@ def isolated(flags: NDArray[np.bool_], known: NDArray[np.intp], most: float, run
 
 
 def basis(columns: Array) -> Array:
-    """Orthonormal columns (N, P) that span the same space as these (N, P)."""
+    """Return orthonormal columns (N, P) that span the same space as these (N, P)."""
     return np.linalg.qr(columns / np.maximum(np.abs(columns).max(axis=0), 1e-300))[0]

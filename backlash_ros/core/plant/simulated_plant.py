@@ -1,6 +1,6 @@
-"""The plant the controller does not know in full: backlash, then G(z), then a sensor (3.1).
+"""The simulated plant: backlash, then G(z), then a sensor (3.1).
 
-Its G(z) may differ from the known one, by way of the G(s), x' = A x + b u, that it samples:
+Its G(z) may differ from the known one by changes to the G(s), x' = A x + b u, that it samples:
 
     exp [A b; 0 0] = [A_z b_z; 0 1]     z = 1 stays an integrator, z = 0 stays a delay
     frequency    G(s / f) / f^k with k integrators: gain at rest, or of the velocity, is kept
@@ -23,7 +23,7 @@ class SimulatedPlant:
     """y = G(z) (B[v] + d + w), measured with noise and a quantum.
 
     d is constant, w a random walk, w(k+1) = w(k) + walk_std sqrt(T) N(0, 1). model: the true G(z).
-    actuator: makes v of the command. applied: the newest v. sample: number of the next one.
+    actuator: turns the command into v. applied: the newest v. sample: number of the next one.
     """
 
     def __init__(
@@ -35,7 +35,7 @@ class SimulatedPlant:
         self._p, self._model, self._x = p, model, [0.0] * model.order
         self._motor = None if actuator is None else Motor(actuator)
         self._rng = np.random.default_rng(p.seed)
-        # Draws of their own: the noise on y is the same with and without a walk.
+        # A generator of its own: the noise on y is the same with and without a walk.
         self._walk_rng = self._rng.spawn(1)[0]
         self._walk, self._walk_step = 0.0, p.truth.walk_std * sqrt(p.sample_period)
 
@@ -44,12 +44,12 @@ class SimulatedPlant:
         return self._p.input_disturbance + self._walk
 
     def change(self, p: Parameters) -> None:
-        """Go on with other parameters; G(z), the actuator and the walk stay what they are."""
+        """Apply other parameters; G(z), the actuator and the walk stay as they are."""
         self._p = p
         self._wear()
 
     def measure(self) -> float:
-        """y(k) as the sensor shows it; call it once per sample."""
+        """Return y(k) as the sensor shows it; to be called once per sample."""
         y = self._x[0]
         noise_std, quantum = self._p.output_noise_std, self._p.output_quantum
         if noise_std > 0.0:
@@ -79,7 +79,7 @@ class SimulatedPlant:
 
 
 def delayed(model: TransferFunction, samples: int) -> TransferFunction:
-    """z^-samples G(z), the delay as poles at 0."""
+    """Return z^-samples G(z), with the delay as poles at 0."""
     denominator = np.append(model.denominator, np.zeros(samples))
     return TransferFunction(model.numerator.tolist(), denominator.tolist())
 
@@ -87,7 +87,7 @@ def delayed(model: TransferFunction, samples: int) -> TransferFunction:
 def altered_plant(
     model: TransferFunction, frequency: float = 1.0, damping: float = 1.0, lag: float = 0.0,
 ) -> TransferFunction:
-    """The altered G(z); the same numbers where nothing but a whole delay is asked for.
+    """Return the altered G(z); its coefficients stay the same if only whole samples are added.
 
     frequency, damping: factors on the natural frequency of every pole and on the damping ratio of
     every pair, > 0. lag: dead time of u [samples], >= 0. Raises ParameterError for a pole on the
@@ -105,7 +105,7 @@ def altered_plant(
     sampled = _block(*inner.state_space()[:2])
     sampled[n, n] = 1.0
     with warnings.catch_warnings():
-        warnings.simplefilter('ignore', RuntimeWarning)  # SciPy tells of an error of 1e-13
+        warnings.simplefilter('ignore', RuntimeWarning)  # SciPy warns of an error of 1e-13
         block = np.real(logm(sampled))
     numerator = _numerator(block[:n, :n], block[:n, n], np.real(np.poly(poles)))
     poles = _damped(poles, damping) * frequency
@@ -129,7 +129,7 @@ def _block(a: Array, b: Array) -> Array:
 
 
 def _numerator(a: Array, b: Array, denominator: Array) -> Array:
-    """Numerator (n,) of (1, 0, ...) (z I - A)^-1 b, of s as of z: from the Markov parameters."""
+    """Return the numerator (n,) in z or s of (1, 0, ...) (z I - A)^-1 b, by Markov parameters."""
     markov = [b]
     for _ in range(len(a) - 1):
         markov.append(a @ markov[-1])

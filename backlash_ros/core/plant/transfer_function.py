@@ -11,15 +11,15 @@ from backlash_ros.core.parameters import ParameterError
 Array = NDArray[np.float64]
 Roots = NDArray[np.complex128]
 
-ON_CIRCLE = 1e-6  # distance from the unit circle, from 0, or between two roots, that is none
+ON_CIRCLE = 1e-6  # distance from the unit circle, from 0, or between two roots that counts as 0
 
 
 class TransferFunction:
     """G(z) with at least one sample of delay, coefficients in descending powers of z.
 
     numerator, denominator: plain sequences of floats; leading zeros of the numerator are dropped.
-    group: of parameters that errors speak of. Raises ParameterError for empty, non-finite or zero
-    polynomials and for a G(z) without delay.
+    group: of the parameters, for error messages. Raises ParameterError for empty, non-finite or
+    zero polynomials and for a G(z) without delay.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class TransferFunction:
 
     @property
     def group_delay(self) -> float:
-        """Samples by which it delays slow motion; no number with a zero or a pole at z = 1."""
+        """Delay of slow motion [samples]; not finite if G has a zero or a pole at z = 1."""
         b, a = self.numerator, self.denominator
         return float(np.polyval(np.polyder(a), 1.0) / a.sum()
                      - np.polyval(np.polyder(b), 1.0) / b.sum())
@@ -59,22 +59,22 @@ class TransferFunction:
         return np.asarray(np.polyval(self.numerator, z) / np.polyval(self.denominator, z))
 
     def without_delay(self) -> tuple[list[float], list[float], int]:
-        """b, a and d [samples], as large as b/a allows that still is a G(z), of z^-d b/a."""
+        """Return b, a and the largest d [samples] with G = z^-d b/a where b/a still has a delay."""
         size = len(self.denominator)
         delay = min(size - len(np.trim_zeros(self.denominator, 'b')), self.delay - 1)
         b, a = np.trim_zeros(self.numerator, 'f'), self.denominator[:size - delay]
         return b.tolist(), a.tolist(), delay
 
     def state_space(self) -> tuple[Array, Array, Array]:
-        """A (n, n), B (n,), C (n,) of x(k+1) = A x + B u, y = C x in observer form: x_0 is y."""
+        """Return A (n, n), B, C (n,) of x(k+1) = A x + B u, y = C x in observer form: x_0 is y."""
         n = self.order
         a = np.eye(n, k=1)
         a[:, 0] = -self.denominator[1:]
         return a, self.numerator[1:].copy(), np.eye(n)[0]
 
     def advance(self, x: list[float], u: float) -> float:
-        """Take a state in the observer form over one sample, in place, and return its y."""
-        y, last = x[0], len(x) - 1  # beside so few numbers a call of NumPy takes longer
+        """Advance a state in observer form by one sample, in place, and return the new y."""
+        y, last = x[0], len(x) - 1  # for so few numbers NumPy takes longer
         for i, (a, b) in enumerate(self._terms):
             x[i] = (x[i + 1] if i < last else 0.0) + a * y + b * u
         return x[0]
@@ -83,10 +83,10 @@ class TransferFunction:
 class StateModel:
     """x(k+1) = A x + B u, y = c x_0 with observability Gramian I over a finite horizon.
 
-    A unit state in any direction then shows with the same energy in y, so that one number tells
-    how unknown x is, and covariances stay well scaled however close the poles of G lie to 1.
-    to_state: from the observer form. memory: samples after which the slowest stable mode has died
-    out. equilibrium: x at rest with y = 1, shape (n,).
+    A unit state in any direction then has the same energy in y, so that one number describes the
+    uncertainty of x, and covariances stay well scaled however close the poles of G lie to 1.
+    to_state: matrix from observer form. memory: samples in which the slowest stable mode decays.
+    equilibrium: x at rest with y = 1, shape (n,).
     """
 
     def __init__(self, model: TransferFunction) -> None:
@@ -113,12 +113,12 @@ class StateModel:
 
 
 def memory_of(slowest: float) -> int:
-    """Samples after which a mode has died out whose pole has this size, within reason."""
+    """Return the samples in which a mode with a pole of this magnitude decays, 150 to 5000."""
     return int(min(max(3.0 / (1.0 - slowest), 150), 5000))
 
 
 def powers(a: Array, b: Array, count: int) -> Array:
-    """b, a b, a^2 b, ... for a (n, n) and b (n,) or (n, m), stacked `count` high."""
+    """Stack `count` terms of b, a b, a^2 b, ... for a (n, n) and b (n,) or (n, m)."""
     stack, factor = b[None], a
     while len(stack) < count:
         stack = np.concatenate([stack, factor @ stack if b.ndim > 1 else stack @ factor.T])
@@ -127,7 +127,7 @@ def powers(a: Array, b: Array, count: int) -> Array:
 
 
 def check_model(model: TransferFunction) -> None:
-    """Raise ParameterError where m, c_r, c_l cannot be learned through G, saying why."""
+    """Raise ParameterError, with the reason, if m, c_r, c_l cannot be learned through this G."""
     poles, numerator = model.poles, model.numerator.tolist()
     for pole in poles:
         if abs(pole) > 1.0 + ON_CIRCLE:
@@ -156,7 +156,7 @@ def check_model(model: TransferFunction) -> None:
 def model_warnings(
     model: TransferFunction, sample_period: float, frequency: float | None = None,
 ) -> list[str]:
-    """Say what makes the estimate ill-conditioned; frequency: of the reference [rad/s] if known."""
+    """Return what makes the estimate ill-conditioned; frequency: of the reference [rad/s]."""
     poles = model.poles
     slow = [_text(pole) for pole in poles if ON_CIRCLE < 1.0 - abs(pole) < 1e-4]
     circle = [_text(zero) for zero in np.roots(model.numerator) if abs(abs(zero) - 1.0) < 1e-3]

@@ -1,1 +1,1 @@
-"""The whole loop without ROS: simulated, recorded, replayed, and what it achieved."""
+"""The whole loop without ROS: simulation, records, replay, and figures of merit."""

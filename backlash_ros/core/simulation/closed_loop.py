@@ -1,7 +1,7 @@
 """The whole loop without ROS: reference, controller and simulated plant, or a recorded run.
 
-A replay computes its command from every recorded y and y_m. It learns from the v that was recorded:
-the reported one where the loop would have believed it, else the command.
+A replay computes a command from every recorded y and y_m. It learns from the v that was recorded:
+the reported one if the loop would have believed it, else the command.
 """
 
 from array import array
@@ -19,7 +19,7 @@ from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord, learned_
 
 
 class ClosedLoop:
-    """Controller, plant and reference stepped together; the seed also draws which y are lost."""
+    """Controller, plant and reference stepped together; p.seed also decides which y are lost."""
 
     def __init__(self, p: Parameters) -> None:
         self.p, self.controller, self.plant = p, build_controller(p), build_plant(p)
@@ -29,7 +29,7 @@ class ClosedLoop:
     def run(self, samples: int) -> RunRecord:
         """Simulate and return every signal."""
         p, controller, plant = self.p, self.controller, self.plant
-        values = array('d')  # row by row: NumPy takes longer to take in a row
+        values = array('d')  # row by row, which is faster than with NumPy
         lost, v = 0, 0.0
         for k in range(samples):
             t = k * p.sample_period
@@ -55,10 +55,10 @@ build_closed_loop = ClosedLoop  # the public name, as of all that is built from 
 def replay(
     recorded: RunRecord, p: Parameters, reports: Sequence[Sequence[float]] = (),
 ) -> RunRecord:
-    """Feed y, y_m, v and losses of a record to a controller with these parameters.
+    """Feed y, y_m, v and losses of a record to a controller; return what it would have done.
 
-    reports: for each row what the driver said to have applied since the row before it. Raises
-    ValueError for rows without numbers, ParameterError for parameters that contradict each other.
+    reports: for each row the v that the driver reported since the row before it. Raises ValueError
+    for rows that are not finite, ParameterError for parameters that contradict each other.
     """
     t = recorded.column('t')
     columns = [recorded.column(name).tolist() for name in ('y_m', 'y', 'v')]
@@ -84,7 +84,7 @@ def replay(
         if k and trust.note(complete) and complete:
             known, scale = controller.estimator.estimate, controller.command_of(1.0)
             if origin.changed_by(reports[k][-1], v_before / scale, known):
-                # As in the loop: what was learned from them so far goes.
+                # As in the loop, what was learned from the reports so far is dropped.
                 before, controller = controller, build_controller(p, origin.before)
                 controller.go_on_from(before)
                 controller.start_from(v_before)
@@ -95,14 +95,14 @@ def replay(
         controller.refine()
         rows[k] = row_of(t[k], y, v, np.nan, step, controller.estimator)
         v_before, v_made = v, step.v
-    for name in ('u', 'true_m', 'true_c_r', 'true_c_l'):  # what no controller can say
+    for name in ('u', 'true_m', 'true_c_r', 'true_c_l'):  # what no controller knows
         rows[:, COLUMNS.index(name)] = recorded.column(name)
     return RunRecord(rows, recorded.sample_period, recorded.lost_samples,
                      learned_model_of(controller.estimator, p))
 
 
 class Parting(NamedTuple):
-    """Time [s] where a replay parts from the run, and the estimate by name and values.
+    """First time [s] at which a replay differs from the run, and in which estimate.
 
     largest: difference over all rows, in standard deviations where they are known, else relative.
     """
@@ -115,7 +115,7 @@ class Parting(NamedTuple):
 
 
 def parting(recorded: RunRecord, replayed: RunRecord) -> Parting | None:
-    """Where the estimates differ by a bit for the first time; None where they never do."""
+    """Return where the estimates first differ, if only by a bit, or None if they never do."""
     first = COLUMNS.index('m')
     own, again = recorded.rows[:, first:first + 3], replayed.rows[:, first:first + 3]
     differs = (own != again) & ~np.isnan(own)

@@ -1,4 +1,4 @@
-"""A run, simulated or recorded: a row per sample, what was believed of G, figures of merit."""
+"""A run, simulated or recorded: a row per sample, the G that was learned, figures of merit."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,10 +18,10 @@ COLUMNS = (
     'u_hat', 'innovation', 'status', 'latency_s', 'true_m', 'true_c_r', 'true_c_l',
 )
 SETTLING_TOLERANCE = 0.01  # of the true value
-# At which the response of G is judged, as shares of the sampling rate: from slow motion to where
-# little is left of it.
+# Frequencies at which the response of G is judged, as fractions of the sampling rate: from slow
+# motion to where little of the response is left.
 FREQUENCIES: tuple[float, ...] = tuple(np.geomspace(0.01, 0.2, 5).tolist())
-# Of what was believed of G, in the order of `controller/model`.
+# Labels of LearnedModel, in the order of `controller/model`.
 MODEL_LABELS = (
     'numerator', 'denominator', 'delay_samples',
     *(f'response_std_at_{share:.4g}_of_sampling_rate' for share in FREQUENCIES),
@@ -34,7 +34,7 @@ LearnedModel = Mapping[str, tuple[float, ...]]
 
 
 def stated_deviations(e: Estimate) -> tuple[float, float, float]:
-    """Those of m, c_r, c_l to publish and record: nan for constants that were given."""
+    """Return the std of m, c_r, c_l to publish and record: nan for constants that were given."""
     return (nan, nan, nan) if was_given(e) else (e.std_m, e.std_c_r, e.std_c_l)
 
 
@@ -42,7 +42,7 @@ def row_of(
     t: float, y: float, v: float, u: float, step: ControlStep, law: Law,
     truth: tuple[float, float, float] = (nan, nan, nan),
 ) -> tuple[float, ...]:
-    """The row of a sample; v: that was sent, u and truth: nan where nobody knows them."""
+    """Return the row of a sample; v: the one that was sent, u and truth: nan if unknown."""
     e = step.estimate
     return (
         t, step.y_m, y, step.u_d, v, u, e.m, e.c_r, e.c_l, e.f, *stated_deviations(e), law.u_hat,
@@ -51,7 +51,7 @@ def row_of(
 
 
 def learned_model_of(law: Law, p: Parameters) -> LearnedModel:
-    """What a law believes of G now: that of the parameters where it does not learn it."""
+    """Return the G that a law has learned so far, or that of the parameters if it learns none."""
     learned, report = law.learned_model, law.report
     model = build_model(p) if learned is None else learned.transfer_function
     response_std = law.response_std(np.exp(2j * np.pi * np.array(FREQUENCIES)))
@@ -63,7 +63,7 @@ def learned_model_of(law: Law, p: Parameters) -> LearnedModel:
 
 
 def complete_model(fields: Mapping[str, Sequence[float]]) -> LearnedModel | None:
-    """The model of a message or a file; None where numbers are missing."""
+    """Return the model of a message or a file, or None if numbers are missing."""
     if not all(fields.get(label) for label in MODEL_LABELS):
         return None
     return {label: tuple(fields[label]) for label in MODEL_LABELS}
@@ -74,10 +74,9 @@ class RunRecord:
     """rows: shape (N, len(COLUMNS)), one per sample that reached the controller.
 
     t [s] counts sample periods from the first one. u and true_* are nan without a simulation.
-    Estimates stand as they were when v was computed. latency_s: from the departure of y(k) at the
+    Estimates are those that v was computed with. latency_s: from the departure of y(k) at the
     driver to that of v(k) at the controller, nan in a simulation. lost_samples: outputs that never
-    arrived.
-    learned: what the controller believed of G at the end, None where it is not known.
+    arrived. learned: the G that the controller had learned at the end, None if not known.
     """
 
     rows: Array
@@ -94,7 +93,7 @@ class RunRecord:
 
     @property
     def has_estimates(self) -> bool:
-        """Whether a controller made it, and not a log of v and y alone."""
+        """Whether it is the run of a controller, not just a log of v and y."""
         return bool(np.isfinite(self.column('m')).any())
 
     @property
@@ -103,7 +102,7 @@ class RunRecord:
 
 
 def settling_time(t: Array, estimate: Array, truth: Array) -> float | None:
-    """First time [s] from which the estimate stays within 1 % of the truth; None if never."""
+    """Return the first time [s] from which an estimate stays within 1 % of the truth, or None."""
     # An estimate that is not a number counts as outside.
     inside = np.abs(estimate - truth) <= SETTLING_TOLERANCE * np.abs(truth)
     settled = np.logical_and.accumulate(inside[::-1])[::-1]
@@ -111,26 +110,26 @@ def settling_time(t: Array, estimate: Array, truth: Array) -> float | None:
 
 
 def control_error(run: RunRecord) -> Array:
-    """e = u - u_d (3.4) of each sample, shape (N,); nan where u is unknown."""
+    """Return e = u - u_d (3.4) of each sample, shape (N,); nan where u is unknown."""
     return run.column('u') - run.column('u_d')
 
 
 def control_error_rms(run: RunRecord) -> float | None:
-    """RMS of e over the last second [unit of u]; None without the true u."""
+    """Return the RMS of e over the last second [unit of u]; None without the true u."""
     e = control_error(run)[run.column('t') > run.column('t')[-1:] - 1.0]
     e = e[np.isfinite(e)]
     return float(np.sqrt(np.mean(e**2))) if e.size else None
 
 
 def delayed_reference(run: RunRecord, delay: int) -> Array:
-    """y_m, `delay` sample periods late, and y(0) before, shape (N,)."""
+    """Return y_m delayed by `delay` sample periods, with y(0) before it begins, shape (N,)."""
     t, y_m = run.column('t'), run.column('y_m')
     newest = np.searchsorted(t, t - (delay - 0.5) * run.sample_period, side='right') - 1
     return np.where(newest >= 0, y_m[np.maximum(newest, 0)], run.column('y')[:1])
 
 
 def delayed_tracking_error_rms(run: RunRecord, delay: int, since: float = 0.0) -> float | None:
-    """RMS of y - y_m(k - delay) over that of y_m, from `since` [s] on; None for y_m = 0."""
+    """Return RMS of y - y_m(k - delay) over that of y_m, from `since` [s] on; None for y_m = 0."""
     rows = run.column('t') >= since
     reference = delayed_reference(run, delay)[rows]
     if not np.any(reference):
@@ -140,7 +139,7 @@ def delayed_tracking_error_rms(run: RunRecord, delay: int, since: float = 0.0) -
 
 
 def turns(values: Array, least: float) -> int:
-    """How often a signal turned back by more than `least` from its extreme."""
+    """Count how often a signal turns back by more than `least` from its extreme."""
     count, direction = 0, 0
     low = high = float(values[0]) if values.size else 0.0
     for value in values.tolist():
@@ -153,7 +152,7 @@ def turns(values: Array, least: float) -> int:
 
 
 def gap_crossings_per_reversal(run: RunRecord, since: float = 0.0) -> float | None:
-    """Turns of v by more than half the gap for each reversal of y_m, from `since` [s] on.
+    """Return the turns of v by over half the gap per reversal of y_m, from `since` [s] on.
 
     None without a true gap or without a reversal.
     """
