@@ -15,6 +15,7 @@
 from math import isnan, sqrt
 
 import numpy as np
+from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.estimation import settings
@@ -26,6 +27,7 @@ from backlash_ros.core.estimation.posterior import Prior, WindowFit, agree
 from backlash_ros.core.estimation.settings import BLOCKS, FEWEST, MISFIT, PREDICTED, SHORT_RECORD
 from backlash_ros.core.estimation.unmodelled import coasts, with_walk
 from backlash_ros.core.plant.numerics import isolated
+from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.window import Window
 
 
@@ -40,6 +42,8 @@ def learn(setup: Setup, record: Window, before: Belief) -> Belief:
         with np.errstate(all='ignore'):
             if before.fit is not None and record.is_open:  # late commands are no contradiction
                 p, since = setup.problem(record, kept.older), before.end - setup.family.memory
+                if record.end >= before.thorough[0]:
+                    since = record.first
                 record, swapped = likelier(p, before.fit, record, since, kept.swapped)
                 before = before._replace(kept=kept._replace(swapped=swapped))
             return look[before.state](setup, record, before)
@@ -151,8 +155,7 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
     problem = setup.problem(record, kept.older)
     fit = problem.fitted(held, FEW_STEPS)
     z = problem.residual(fit)[new:] / held.noise
-    wild = isolated(np.abs(z) > settings.GATE, np.flatnonzero(np.isfinite(z)),
-                    settings.OUTLIER_SHARE, settings.OUTLIERS)
+    wild = _outliers(z)
     if wild.any():
         numbers = frozenset((record.first + new + np.flatnonzero(wild)).tolist())
         cleaned = before._replace(kept=kept._replace(rejected=kept.rejected | numbers))
@@ -172,8 +175,10 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
             end=record.end, found=None, trial=trial._replace(must=must),
             doubt_from=record.first + new + change, next_at=record.end + FEWEST,
             reason=Status.INCONSISTENT if lately else before.reason)
+    # A look before it was due: what surprised may have begun just now.
+    soon = FEWEST if record.end < before.next_at else max(count // BLOCKS, FEWEST)
     after = before._replace(
-        end=record.end, next_at=record.end + max(count // BLOCKS, FEWEST),
+        end=record.end, next_at=record.end + soon,
         trial=trial._replace(predicted=trial.predicted + count - new))
     look_at, look_below = before.thorough
     if record.end >= look_at or (fit.gap_std < look_below and count <= SHORT_RECORD):
@@ -211,8 +216,13 @@ def _contradicts(
     weights, z = weights[new:], z[new:]
     count, wild = float(weights.sum()), np.abs(z) > settings.GATE
     mean = float(np.nansum(weights * np.where(wild, 0.0, z**2))) / max(count, 1e-300)
-    return mean > _most(MISFIT, count, rho) \
-        or float(wild.sum()) > settings.OUTLIER_SHARE * np.isfinite(z).sum()
+    return mean > _most(MISFIT, count, rho) or bool((wild & ~_outliers(z)).any())
+
+
+def _outliers(z: Array) -> NDArray[np.bool_]:
+    """Which normalized residuals (N,), nan where y was lost, are outliers."""
+    return isolated(np.abs(z) > settings.GATE, np.flatnonzero(np.isfinite(z)),
+                    settings.OUTLIER_SHARE, settings.OUTLIERS)
 
 
 def _most(least: float, count: float, rho: float) -> float:

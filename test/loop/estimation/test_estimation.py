@@ -10,7 +10,7 @@ from cases.held_up import HeldUpProcesses
 from cases.loops import motor
 from contract.figures import judged
 from contract.learning_rows import PAPER as EXACT
-from contract.learning_rows import Job, Outcome, changes_jobs, run_job
+from contract.learning_rows import Job, Outcome, changes_jobs, learned_again_s, run_job
 from ordinary_motions import all_cases, run_case
 from places import ROOT
 from scipy.special import chdtri
@@ -64,6 +64,11 @@ def test_wear_and_a_step_of_a_crossing_are_followed(seed: int) -> None:
     c_r = np.abs(run.column('c_r') / run.column('true_c_r') - 1.0)
     assert judged(run).m[100:].max() <= 0.02
     assert max(c_r[100:1000].max(), c_r[1100:].max()) <= 0.03
+
+
+def test_a_jump_that_the_error_of_g_can_explain_at_first_is_learned_as_soon_as_any() -> None:
+    job = [job for job in changes_jobs(1.0) if job.group == 'jump'][9]
+    assert 0.0 < learned_again_s(run_job(job).judged) < 0.45
 
 
 @pytest.mark.parametrize('known', [0.0, 0.4])
