@@ -1,4 +1,4 @@
-"""Many simulated runs: seeds and sweeps as jobs, here or on a cluster, and their statistics."""
+"""Simulate seeds and sweeps as jobs, here or on a cluster, and compute their statistics."""
 
 import logging
 import multiprocessing
@@ -24,8 +24,8 @@ from backlash_ros.tools.runs.read_run import run_loop
 from backlash_ros.tools.runs.summary import summarise
 from backlash_ros.topics import BACKLASH
 
-CLUSTER_ANSWER_S = 10.0  # for a scheduler to answer, and for a first worker to be there
-# What an outcome has of m, c_r and c_l: the beginning of a column, and the group in a summary.
+CLUSTER_ANSWER_S = 10.0  # timeout for the scheduler to answer, and for a first worker
+# Of m, c_r and c_l an outcome has: prefix of the column, and group in a summary.
 OUTCOME_GROUPS = {
     '': 'final', 'std_': 'final_std', 'true_': 'truth', 'settling_': 'settling_time_s',
 }
@@ -34,13 +34,13 @@ OUTCOME_COLUMNS = (
     'control_error_rms', 'tracking_error_rms', 'lost_samples', 'problem',
 )
 STATISTICS = 'bias', 'RMSE', 'settled, median', 'settled, last', 'within 1 %'
-Job = tuple[Parameters, int]  # one run: its parameters and its length in samples
-# What a run came to, under OUTCOME_COLUMNS; problem: why it broke off, '' where it did not.
+Job = tuple[Parameters, int]  # a run: its parameters and number of samples
+# Results of a run by OUTCOME_COLUMNS; problem: why it broke off, '' if it did not.
 Outcome = Mapping[str, float | str | None]
 
 
 def combinations(texts: Sequence[str]) -> list[dict[str, Value]]:
-    """Every combination of sweeps `KEY=v1,v2,...`, as in YAML, the last one changing fastest."""
+    """All combinations of sweeps `KEY=v1,v2,...` (YAML); the last one varies fastest."""
     sweeps: dict[str, list[Value]] = {}
     for text in texts:
         name, _, listed = map(str.strip, text.partition('='))
@@ -60,7 +60,7 @@ def make_jobs(
     parameters: Parameters, changes: Sequence[Mapping[str, Value]], seeds: Sequence[int],
     duration: float | None,
 ) -> list[Job]:
-    """One job for each change and each seed; every combination is built once, and so checked."""
+    """One job for each change and seed; each combination is built once, to check it."""
     jobs = []
     for change in changes:
         changed = parameters.replaced(change)
@@ -72,7 +72,7 @@ def make_jobs(
 
 
 def run_job(job: Job) -> Outcome:
-    """Simulate one run; a run that breaks off is an outcome too."""
+    """Simulate one run; its outcome says so if it broke off."""
     parameters, samples = job
     try:
         summary = summarise(run_loop(build_closed_loop(parameters), samples), parameters)
@@ -86,10 +86,10 @@ def run_job(job: Job) -> Outcome:
 def run_jobs(
     jobs: Sequence[Job], workers: int | None = None, cluster: str | None = None, label: str = '',
 ) -> list[Outcome]:
-    """Outcomes in the order of the jobs, the same wherever they were computed.
+    """Run jobs; their outcomes are in order, and do not depend on where they were computed.
 
-    workers: None takes one process per processor, 1 none besides this one. cluster: address of a
-    Dask scheduler, whose workers are used instead.
+    workers: number of processes, one per processor if None; 1 stays in this process. cluster:
+    address of a Dask scheduler, whose workers are used instead.
     """
     workers = min(workers or len(os.sched_getaffinity(0)), len(jobs))
     finished = _on_cluster(jobs, cluster) if cluster is not None else \
@@ -102,17 +102,16 @@ def _in_processes(jobs: Sequence[Job], workers: int) -> Iterator[Outcome]:
     executor = ProcessPoolExecutor(
         workers, multiprocessing.get_context('spawn'), initializer=end_with_parent)
     try:
-        # A signal that would cut short the start of a worker takes effect afterwards, whichever
-        # thread gets it.
+        # A signal while workers start takes effect afterwards, whichever thread gets it.
         with cli.StopRequests() as held:
-            # Workers inherit for good what is blocked: a Ctrl-C is for their parent alone.
+            # Workers inherit the blocked signals for good: Ctrl-C is for their parent alone.
             signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
             outcomes = [executor.submit(run_job, job) for job in jobs]
             signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
         if held.count:
             raise KeyboardInterrupt
         for outcome in outcomes:
-            # A signal just before a wait, or in another thread, is noticed at the end of the wait.
+            # A signal just before a wait, or in another thread, is noticed only after it.
             while not wait([outcome], timeout=0.2).done:
                 pass
             yield outcome.result()
@@ -125,7 +124,7 @@ def _in_processes(jobs: Sequence[Job], workers: int) -> Iterator[Outcome]:
 
 
 def _on_cluster(jobs: Sequence[Job], address: str) -> Iterator[Outcome]:
-    """A run whose worker is lost is given to another one. address: as tcp://HOST:PORT."""
+    """Run jobs on a cluster; a job of a lost worker goes to another. address: tcp://HOST:PORT."""
     try:
         from distributed import Client, KilledWorker, TimeoutError
     except ImportError:
@@ -136,7 +135,7 @@ def _on_cluster(jobs: Sequence[Job], address: str) -> Iterator[Outcome]:
     try:
         with Client(address, timeout=CLUSTER_ANSWER_S, set_as_default=False) as client:
             client.wait_for_workers(1, timeout=CLUSTER_ANSWER_S)
-            # Not pure: runs of the same parameters are runs all the same.
+            # Not pure: Dask is not to merge runs with the same parameters.
             for future in client.map(run_job, jobs, pure=False):
                 yield future.result()
     except (KilledWorker, CancelledError):
@@ -153,7 +152,7 @@ def _on_cluster(jobs: Sequence[Job], address: str) -> Iterator[Outcome]:
 def statistics(outcomes: Sequence[Outcome]) -> dict[str, tuple[float, ...]]:
     """STATISTICS of each estimate over the runs that did not break off.
 
-    Settling times in s, inf for never. Raises InputError where all broke off.
+    Settling times in s, inf for never. Raises InputError if all broke off.
     """
     whole = [outcome for outcome in outcomes if not outcome['problem']]
     if not whole:

@@ -1,4 +1,4 @@
-"""What the command lines of all tools share: options, errors, signals, tables."""
+"""What all command-line tools share: options, errors, signals, tables."""
 
 import argparse
 import atexit
@@ -14,17 +14,17 @@ from backlash_ros.core.parameters import ParameterError, Parameters
 from backlash_ros.options import BAD_INPUT, DONE, FAILED
 from backlash_ros.tools.records.columns import parse_columns
 
-NOTHING = '–'  # in a table, where there is no number
-# The matrices are tiny: more threads would only take the processors from other processes.
+NOTHING = '–'  # stands in tables for a missing number
+# Matrices are tiny: more threads would only take processors from other processes.
 ONE_THREAD = dict.fromkeys(('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'), '1')
 
 
 class InputError(ValueError):
-    """Something the user gave cannot be used: one line says what, why and, if known, the cure."""
+    """The user's input cannot be used: one line says what, why, and the cure if it is known."""
 
 
 class BrokenOffError(RuntimeError):
-    """A run could not go on, although everything given was valid: one line says why."""
+    """A run could not go on, although its input was valid: one line says why."""
 
 
 class Span(NamedTuple):
@@ -64,7 +64,7 @@ def add_options(parser: argparse.ArgumentParser, *names: str) -> argparse.Argume
 
 
 def span_of(options: argparse.Namespace) -> Span:
-    """The part of a run between --from and --to; raises InputError where there is none."""
+    """The part of a run between --from and --to; raises InputError unless --from < --to."""
     if not options.from_s < options.to_s:
         raise InputError(f'--from {options.from_s:g} must be < --to {options.to_s:g}')
     return Span(options.from_s, options.to_s)
@@ -78,7 +78,7 @@ def number_of_samples(parameters: Parameters, duration: float | None) -> int:
     if not 0.0 < duration < inf:
         raise InputError(f'--duration={duration!r} must be finite and > 0')
     samples = round(duration / period)
-    # It may miss a whole number by rounding alone.
+    # Rounding may keep the quotient from being a whole number.
     if samples < 1 or abs(duration / period - samples) > 1e-6 * samples:
         raise InputError(f'--duration={duration!r} must be a whole multiple of '
                          f'sample_period={period!r}')
@@ -89,17 +89,17 @@ def run_tool(
     name: str, tool: Callable[[Sequence[str] | None], int | None],
     args: Sequence[str] | None = None,
 ) -> int:
-    """Run a tool and return its exit code; whatever stops it becomes one line on stderr.
+    """Run a tool and return its exit code; errors are reported in one line on stderr.
 
-    Call it from the main thread: a SIGTERM stops the tool as a Ctrl-C does.
+    Call it from the main thread: SIGTERM stops the tool as Ctrl-C does.
     """
     handler = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    # The interpreter takes a while to end, in which another Ctrl-C would change the exit code.
+    # The interpreter takes a while to end: another Ctrl-C then would change the exit code.
     atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
     try:
         return tool(args) or DONE
     except SystemExit as ended:
-        return int(ended.code or DONE)  # the parser of the options has said why
+        return int(ended.code or DONE)  # the option parser has said why
     except (ParameterError, InputError, BrokenOffError, OSError, KeyboardInterrupt) as error:
         print(f'{name}: {str(error) or "interrupted"}', file=sys.stderr)
         return BAD_INPUT if isinstance(error, (ParameterError, InputError)) else FAILED
@@ -108,15 +108,15 @@ def run_tool(
 
 
 def print_warnings(name: str, parameters: Parameters) -> None:
-    """Print on stderr what is allowed but will make the estimate hard."""
-    # The options are read before numpy and scipy are loaded.
+    """Print on stderr which parameters are allowed but will make estimation hard."""
+    # Imported here, as options are parsed before numpy and scipy are loaded.
     from backlash_ros.core.assembly import warnings_of
     for warning in warnings_of(parameters):
         print(f'{name}: warning: {warning}', file=sys.stderr)
 
 
 def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Columns aligned: the first to the left, all others to the right."""
+    """A table as text, the first column aligned to the left, the others to the right."""
     widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
     return '\n'.join(
         '  '.join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip()
@@ -131,9 +131,9 @@ def number(value: float | None, digits: int = 4, unit: str = '', scale: float = 
 
 
 class StopRequests:
-    """Counts SIGINT, SIGTERM and SIGHUP as long as the context lasts, instead of dying of them.
+    """Counts SIGINT, SIGTERM and SIGHUP while the context lasts, instead of dying of them.
 
-    What follows within 0.2 s does not count: a Ctrl-C may come from two sides.
+    A second one within 0.2 s does not count, as the same Ctrl-C may arrive twice.
     """
 
     count, last, _came_at_s = 0, '', -inf
@@ -142,7 +142,7 @@ class StopRequests:
         self._before = {
             caught: signal.signal(caught, self._note)
             for caught in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-            # Under nohup a hang-up stays ignored.
+            # Under nohup SIGHUP stays ignored.
             if caught != signal.SIGHUP or signal.getsignal(caught) is not signal.SIG_IGN
         }
         return self

@@ -1,4 +1,4 @@
-"""`compare`: every law and structure on one scenario, as a figure, a table and a document."""
+"""`compare`: run every law and structure on one scenario; write a figure, a table, a document."""
 
 import argparse
 import sys
@@ -28,14 +28,14 @@ COMPARISON_HEADER = (
     'loop', 'control error', 'tracking error', 'backlash penalty', 'total variation of v',
     'crossings per reversal',
 )
-# No gap is wider than this one by definition (2.1), which is as good as none.
+# As good as no gap at all; definition (2.1) needs one.
 GAPLESS = {'backlash.c_r': 1e-9, 'backlash.c_l': -1e-9}
 
 
 class Result(NamedTuple):
-    """What became of a loop; merits: as the table has them. note: why the run broke off.
+    """Result of one loop. merits: cells of the table. note: why the run broke off, if it did.
 
-    delay: samples by which y is to follow y_m late, None where it is not to.
+    delay: samples by which y is to follow y_m, None if it is not meant to follow.
     """
 
     name: str
@@ -46,11 +46,11 @@ class Result(NamedTuple):
 
 
 def contenders(scenario: Parameters) -> dict[str, Parameters]:
-    """The loops by name, from the paper's to the one without a backlash."""
+    """Parameters of the loops by name, from the paper's to the one without a backlash."""
     m, c_r, c_l = (getattr(scenario.backlash, name) for name in BACKLASH)
-    # Saved estimates would favour the law that they are of.
+    # Saved estimates would favour the law that learned them.
     paper = scenario.replaced({'structure': 'proportional', 'estimates.load': False})
-    # y_m is scaled by |G| at its frequency, so that every loop asks for the same motion of G.
+    # y_m is scaled by |G| at its frequency, so that every loop demands the same motion of G.
     z = np.exp(1j * scenario.frequency * scenario.sample_period)
     gain = abs(complex(build_model(scenario).response(np.array([z]))[0]))
     tracking = paper.replaced({'structure': 'tracking', 'amplitude': gain * scenario.amplitude,
@@ -61,7 +61,7 @@ def contenders(scenario: Parameters) -> dict[str, Parameters]:
            for law in ('printed', 'lms', 'moving_horizon')},
         'gradient, four blocks': tracking.replaced({
             'structure': 'pole_placement', 'estimator.law': 'gradient',
-            # With less, y, which they feed back unfiltered, has to be less noisy.
+            # A smaller weight needs a less noisy y, which these blocks feed back unfiltered.
             'tracking.input_weight': 1.0,
         }),
         'moving_horizon, tracking': tracking.replaced({'estimator.law': 'moving_horizon'}),
@@ -116,7 +116,7 @@ def _compare(args: Sequence[str] | None) -> None:
     if options.out is not None:
         result_directory(options.out)  # fails before long runs, not after them
     results = compare(scenario, samples)
-    # Drawing libraries take a second to load, which bad input should not cost.
+    # Imported here, as drawing libraries take a second to load.
     from backlash_ros.tools.figures import draw_error_curves, png
     rows = [(each.name, *(cli.number(merit, 3) for merit in each.merits)) for each in results]
     print(cli.format_table(COMPARISON_HEADER, rows))

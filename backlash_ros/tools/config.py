@@ -1,7 +1,7 @@
-"""Parameters from ROS 2 parameter files and the command line, and back into such a file.
+"""Read parameters from ROS 2 parameter files and the command line, and write such files.
 
 A section /AXIS/NODE holds values of one node of one axis; ** stands for all axes or all nodes, and
-/NODE for the node without a namespace. A named node goes before a named axis.
+/NODE for the node without a namespace. A named node takes precedence over a named axis.
 """
 
 import difflib
@@ -31,9 +31,9 @@ ANY = '**'
 
 
 class Configuration(NamedTuple):
-    """A file with what the command line changes in it; axes of controllers, joints of one.
+    """A parameter file with changes by the command line; its axes, or joints of the only one.
 
-    sections: checked values by their names; settings: axis, empty for all, name and value.
+    sections: checked values by section and name. settings: (axis or '' for all, name, value) each.
     """
 
     path: Path
@@ -44,13 +44,13 @@ class Configuration(NamedTuple):
     joints: tuple[str, ...]
 
     def parameters(self, axis: str = '') -> Parameters:
-        """Of a loop, maybe that of a joint: defaults, the file, --set, --seed."""
+        """Parameters of one loop, of an axis or a joint: defaults, the file, --set, --seed."""
         if self.joints:
             _check_axis(self.path, axis, self.joints)
         return self.of_controller('' if self.joints else axis).of_joint(axis)
 
     def of_controller(self, axis: str = '') -> Parameters:
-        """Return the same for one controller, with what each of its joints has of its own."""
+        """The same for one controller, with the own parameters of each of its joints."""
         values: dict[str, object] = {**self.given(axis)}
         for meant, name, value in sorted(self.settings, key=lambda setting: setting[0] != ''):
             if meant in ('', axis):
@@ -78,7 +78,7 @@ class Configuration(NamedTuple):
 
 
 def _sections_for(axis: str) -> tuple[list[str], ...]:
-    """Names of what concerns an axis, '' for a loop without one, the most specific ones last."""
+    """Names of the sections for an axis, '' for a loop without one, the most specific ones last."""
     own = f'/{axis}' if axis else ''
     return ([f'/{ANY}'], [f'{own}/{ANY}'], [f'/{ANY}/{node}' for node in NODES],
             [f'/{BRINGUP}', *(f'{own}/{node}' for node in NODES)])
@@ -87,7 +87,7 @@ def _sections_for(axis: str) -> tuple[list[str], ...]:
 def read_configuration(
     config: Path | None, settings: Sequence[str] = (), seed: int | None = None,
 ) -> Configuration:
-    """Read and check everything, as `find_config` finds it; raises InputError, ParameterError."""
+    """Read the file that `find_config` finds and check all; raises InputError, ParameterError."""
     path, parsed = find_config(config), list(map(parse_setting, settings))
     sections = _read_sections(path)
     try:
@@ -118,7 +118,7 @@ def read_configuration(
 
 
 def parse_setting(text: str) -> tuple[str, str, Value]:
-    """Return the checked content of `KEY=VALUE` or `AXIS/KEY=VALUE`, the value as in YAML."""
+    """Parse `KEY=VALUE` or `AXIS/KEY=VALUE`, VALUE in YAML; returns axis, name, checked value."""
     key, equals, given = text.partition('=')
     axis, slash, name = key.strip().rpartition('/')
     if not (equals and name) or (slash and not axis):
@@ -139,7 +139,7 @@ def _check_axis(where: object, axis: str, known: Sequence[str]) -> None:
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """Refuses a key given twice, of which YAML would keep the last one."""
+    """Refuses a key that is given twice; YAML would keep the last value."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         keys = [self.construct_object(key, deep=True) for key, _ in node.value]
@@ -151,7 +151,7 @@ class _StrictLoader(yaml.SafeLoader):
 
 
 def _read_sections(path: Path) -> dict[str, dict[str, object]]:
-    """Values of the sections, by their names with and by their own flat names."""
+    """Values by section, whose name begins with /, and by flat name."""
     try:
         document = yaml.load(path.read_text(encoding='utf-8'), Loader=_StrictLoader)
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
@@ -169,7 +169,7 @@ def _read_sections(path: Path) -> dict[str, dict[str, object]]:
 
 
 def flattened(tree: Mapping[object, object], prefix: str = '') -> Iterator[tuple[str, object]]:
-    """Names, with points in them, and values of nested sections."""
+    """Flat names, with dots, and values of a nested mapping."""
     for key, value in tree.items():
         if isinstance(value, dict):
             yield from flattened(value, f'{prefix}{key}.')
@@ -186,12 +186,12 @@ _Dumper.add_representer(list, lambda dumper, values: dumper.represent_sequence(
 
 
 def write_config(parameters: Parameters, path: Path) -> None:
-    """Write the complete set as a ROS 2 parameter file that every node accepts."""
+    """Write all parameters to a ROS 2 parameter file that every node accepts."""
     write_atomically(path, config_text(parameters))
 
 
 def config_text(parameters: Parameters) -> str:
-    """Content of that file, without empty lists, which ROS 2 does not have."""
+    """The text of such a file, without empty lists, which ROS 2 does not allow."""
     common = [p for p in BY_NAME.values() if parameters[p.name] != ()
               and (p.used_by != (BRINGUP,) or parameters[p.name] != p.default)]
     values = {p.name: parameters[p.name] for p in common}

@@ -1,4 +1,4 @@
-"""Every figure of `report`, `compare` and `identify`, and what others draw theirs with."""
+"""All figures of `report`, `compare` and `identify`, and helpers that other figures use as well."""
 
 import io
 from collections.abc import Mapping, Sequence
@@ -23,10 +23,10 @@ from backlash_ros.tools.cli import number
 from backlash_ros.tools.runs.summary import ERROR_WINDOW_S, moving_rms
 from backlash_ros.topics import BACKLASH
 
-Line = tuple[Any, ...]  # what `curve` takes behind the axes: t, values, colour and further ones
+Line = tuple[Any, ...]  # arguments of `curve` after the axes: t, values, colour and more
 
 TIME_LABEL = 'time t [s]'  # label of an axis
-# Okabe-Ito and Tol: distinct with every kind of colour vision.
+# Palettes of Okabe-Ito and Tol: distinct with every kind of colour vision.
 HUES = {
     'm': '#0072B2', 'c_r': '#D55E00', 'c_l': '#009E73', 'v': '#CC79A7', 'u_d': '#E69F00',
     'y': '#332288', 'y_m': '#777777', 'u': '#000000', 'e': '#882255', 'true': '#000000',
@@ -40,9 +40,9 @@ matplotlib.style.use(Path(__file__).with_suffix('.mplstyle'))
 
 
 def new_figure(height: float, laid_out: bool = True) -> Figure:
-    """Figure of the common width that needs no display; not laid out: margins that suit most."""
+    """Figure of the common width, without a display. laid_out: False for fixed margins."""
     figure = Figure(figsize=(10.0, height), constrained_layout=laid_out)
-    if not laid_out:  # which takes as long as to draw it
+    if not laid_out:  # laying out takes as long as drawing
         figure.subplots_adjust(left=0.1, right=0.985, bottom=0.55 / height,
                                top=1.0 - 0.4 / height, wspace=0.2, hspace=0.4)
     return figure
@@ -50,13 +50,13 @@ def new_figure(height: float, laid_out: bool = True) -> Figure:
 
 def png(figure: Figure) -> bytes:
     buffer = io.BytesIO()
-    # savefig would lay it out, and go through all there is to draw, once more.
+    # savefig would lay it out and draw it once more.
     FigureCanvasAgg(figure).print_png(buffer)
     return buffer.getvalue()
 
 
 def label(axes: Axes, title: str = '', y: str = '', x: str = '') -> None:
-    """Set the title and the labels with units that are given."""
+    """Set the title and the labels of the axes, if given."""
     texts = {'title': title, 'ylabel': y, 'xlabel': x}
     axes.set(**{key: text for key, text in texts.items() if text})
 
@@ -89,7 +89,7 @@ def band(axes: Axes, t: Array, low: Array, high: Array, colour: str, name: str =
 
 
 def shade(axes: Axes, t: Array, where: NDArray[np.bool_], name: str) -> None:
-    if where.any():  # otherwise it is not in the legend either
+    if where.any():  # otherwise the legend would have an entry all the same
         axes.fill_between(t, 0, 1, where=where.tolist(), transform=axes.get_xaxis_transform(),
                           step='post', color='#bbbbbb', alpha=0.4, linewidth=0, label=name)
 
@@ -108,8 +108,8 @@ def draw_panels(
 ) -> tuple[Figure, NDArray[Any]]:
     """A figure whose columns show parts of a run, and its axes, shape (rows, parts).
 
-    rows: lines by what stands at the vertical axis. parts: rows of the run by name. frozen_in:
-    shades its times without learning.
+    rows: lines by label of the vertical axis. parts: samples of the run by title. frozen_in: run
+    whose times without learning are shaded.
     """
     figure = new_figure(height, laid_out)
     grid = np.asarray(figure.subplots(len(rows), len(parts), sharex='col', squeeze=False, **others))
@@ -139,7 +139,7 @@ def draw_parameter_errors(
         truth, hue, style = run.column(f'true_{name}'), HUES[name], LINE_STYLES[name]
         error, unit = truth - run.column(name), BACKLASH_UNITS[name].removeprefix('unit of ')
         errors.append((t, error, hue, f'${name} - {HATS[name]}$ [{unit}]', style, 1.8))
-        # Nothing is a percentage of zero, and the logarithm has no zero.
+        # A truth of 0 has no percentages, and a logarithmic axis no 0.
         size = np.maximum(100.0 * np.abs(error / np.where(truth == 0.0, np.nan, truth)), 1e-6)
         percents.append((t, size, hue, '', style, 1.5))
     figure, grid = draw_panels(7.4, {
@@ -159,9 +159,9 @@ def draw_parameter_errors(
 
 
 def draw_estimates(run: RunRecord, recorded: RunRecord | None = None) -> Figure:
-    """Estimates over time with two standard deviations, and the truth where it is known.
+    """Estimates over time with two standard deviations, and the truth if it is known.
 
-    recorded: of a replay, the run whose estimates, innovation and status are shown instead of it.
+    recorded: the run that was replayed; its estimates, innovation and status replace the truth.
     """
     t, names = run.column('t'), {f'${HATS[n]}$ [{BACKLASH_UNITS[n]}]': n for n in BACKLASH}
     beside, prefix, wide, own = run, 'true_', 'true', 'estimated'
@@ -175,8 +175,8 @@ def draw_estimates(run: RunRecord, recorded: RunRecord | None = None) -> Figure:
     for axes, name in zip(grid[:, 0], BACKLASH, strict=False):
         estimate, std = run.column(name), 2 * run.column(f'std_{name}')
         band(axes, t, estimate - std, estimate + std, HUES[name], '±2 standard deviations')
-        # The first, nearly boundless uncertainty would flatten everything else: the limits are
-        # those of the curves, with a margin for the deviations.
+        # The huge initial uncertainty would flatten everything else: the limits are those of the
+        # curves, with a margin for the standard deviations.
         axes.set_ylim(*limits([estimate, beside.column(f'{prefix}{name}')], 0.25))
         label(axes, f'${HATS[name]}$ = {estimate[-1]:.6g} ± {number(std[-1], 2)} at the end')
         legend_above(axes)
@@ -186,13 +186,13 @@ def draw_estimates(run: RunRecord, recorded: RunRecord | None = None) -> Figure:
 
 
 def draw_closer(run: RunRecord, values: Array, name: str, parts: Mapping[str, slice]) -> Figure:
-    """A signal over the whole run, and beside it closer over each part."""
+    """A signal over the whole run and, beside it, over each part."""
     lines = [(run.column('t'), values, HUES['e'])]
     return draw_panels(3.6, {name: lines}, {**WHOLE_RUN, **parts}, run)[0]
 
 
 def draw_hysteresis(run: RunRecord, end: slice) -> Figure:
-    """v-u loop at the end of the run with the true and the estimated lines."""
+    """The v-u loop at the end of a run, with the true and the estimated lines."""
     figure = new_figure(6.0)
     axes = figure.subplots()
     v, truth = run.column('v'), run.has_truth
@@ -216,7 +216,7 @@ def draw_hysteresis(run: RunRecord, end: slice) -> Figure:
 
 
 def draw_output(run: RunRecord, end: slice, delay: int, followed: bool) -> Figure:
-    """Reference, `delay` samples late, and output: on one scale where y follows, else on two."""
+    """Reference, delayed by `delay` samples, and output: on one scale if y follows, else on two."""
     t, y, y_m = run.column('t'), run.column('y'), run_record.delayed_reference(run, delay)
     late = f', {delay * run.sample_period:.4g} s late' if delay else ''
     reference, output = (t, y_m, HUES['y_m']), (t, y, HUES['y'])
@@ -245,12 +245,12 @@ def draw_input(run: RunRecord, parts: Mapping[str, slice]) -> Figure:
 def draw_error_curves(runs: Mapping[str, RunRecord], delays: Mapping[str, int] = {}) -> Figure:
     """Moving RMS of the control errors (Figure 5 of the paper) and of tracking errors.
 
-    delays: samples by which y is to follow y_m late, of the runs in which it is to.
+    delays: samples by which y is to lag y_m, for those runs in which it is to follow.
     """
     colours = [HUES[name] for name in ('m', 'c_r', 'c_l', 'v', 'u_d', 'y', 'y_m', 'u')]
     rows: dict[str, list[Line]] = {}
     for i, (name, run) in enumerate(runs.items()):
-        # The curve of the loop without backlash comes to lie on that of the one that has learned.
+        # Wide, as the curve of the loop without backlash will cover it.
         width = 3.4 if name == 'moving_horizon, tracking' else 1.7
         look = colours[i % 8], name, ('-', '--', '-.', ':')[i % 4], width
         errors = {'u - u_d': run_record.control_error(run)}
@@ -266,7 +266,7 @@ def draw_error_curves(runs: Mapping[str, RunRecord], delays: Mapping[str, int] =
         known = [size[np.isfinite(size) & (size > 0.0)] for _, size, *_ in lines]
         if highest := [float(size.max()) for size in known if size.size]:
             axes.set_yscale('log')
-            # An error begins at zero; a law that diverges leaves the axes.
+            # Leave out errors near 0 at the start, and curves of laws that diverge.
             low, high = np.percentile(np.concatenate(known), 2), 1e3 * np.median(highest)
             axes.set_ylim(0.6 * float(low), 1.7 * min(max(highest), float(high)))
     legend_below(figure, grid[0, 0])
@@ -283,7 +283,7 @@ def draw_log(run: RunRecord) -> Figure:
 
 
 def draw_held_out(found: Identification, details: Details) -> Figure:
-    """Measured and simulated y on samples that were held out, and the difference."""
+    """Measured and simulated y on the held-out samples, and the difference."""
     first, y, simulated, rms, _ = details.held_out
     t = _times(found, first, simulated)
     figure, grid = draw_panels(6.2, {
@@ -303,7 +303,7 @@ def _times(found: Identification, first: int, values: Array) -> Array:
 
 
 def draw_loop(found: Identification, details: Details) -> Figure:
-    """y over v as measured, and what the backlash that was found takes from v."""
+    """y over v as measured, and what the identified backlash subtracts from v."""
     newest, figure = slice(-4000, None), new_figure(4.6, laid_out=False)
     left, right = figure.subplots(1, 2)
     v, o = details.v[newest], details.observed
@@ -319,7 +319,7 @@ def draw_loop(found: Identification, details: Details) -> Figure:
 
 
 def draw_residual(found: Identification, details: Details) -> Figure:
-    """y minus the simulation of the whole record: over time, autocorrelated, and over v."""
+    """Residual of the whole record: over time, its autocorrelation, and over v."""
     figure, residual = new_figure(6.6, laid_out=False), details.observed.residual
     over_time, correlated, over_v = figure.subplot_mosaic('tt;cv').values()
     curve(over_time, _times(found, details.first, residual), residual, HUES['e'], width=0.8)
@@ -339,7 +339,7 @@ def draw_residual(found: Identification, details: Details) -> Figure:
 
 
 def draw_bode(found: Identification, details: Details) -> Figure:
-    """Frequency response of m G with two standard deviations; dotted: where y moved."""
+    """Frequency response of m G with two standard deviations; y moved between the dotted lines."""
     w = np.geomspace(max(found.model.frequencies[0] / 5.0, 1e-5), 0.98 * np.pi, 400)
     f = w / (2.0 * np.pi * found.sample_period)
     value = details.response.at(w) * np.exp(-1j * w * found.model.delay)

@@ -1,4 +1,4 @@
-"""Self-contained HTML pages: no script, no font, no picture from elsewhere."""
+"""Write self-contained HTML pages, which load no script, font or picture from elsewhere."""
 
 import base64
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from backlash_ros.atomic_file import write_atomically
 
 
 class Picture(NamedTuple):
-    """A figure of a page: name of its PNG file, heading, what to see in it (HTML)."""
+    """A figure on a page: name of its PNG file, heading, caption (HTML), content of the file."""
 
     name: str
     heading: str
@@ -23,9 +23,9 @@ def write_page(
     path: Path, title: str, lead: str, warnings: Sequence[str], parts: Sequence[str],
     pictures: Sequence[Picture], folded: tuple[str, str] | None = None,
 ) -> None:
-    """Write a page, and its pictures beside it as well.
+    """Write a page with its pictures, and the pictures as files beside it as well.
 
-    lead, parts: HTML. folded: heading and text of a last section.
+    lead, parts: HTML. folded: heading and text of a last section, which is closed at first.
     """
     sections = list(parts)
     for file, name, caption, data in pictures:
@@ -43,7 +43,7 @@ def write_page(
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table of cells that are HTML; without a header its rows are names and values."""
+    """An HTML table of HTML cells; without a header, its rows are names and values."""
     lines = [''.join(f'<th>{cell}</th>' for cell in header),
              *(''.join(f'<td>{cell}</td>' for cell in row) for row in rows)]
     kind = 'values' if header else 'facts'

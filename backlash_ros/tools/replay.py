@@ -1,4 +1,4 @@
-"""`replay`: a recorded run through the controller once more, with other parameters if wanted."""
+"""`replay`: run the controller again on a recorded run, with other parameters if wanted."""
 
 import argparse
 import sys
@@ -65,7 +65,7 @@ def _replay(args: Sequence[str] | None) -> None:
 
 
 def _opened(path: Path, options: argparse.Namespace, span: cli.Span) -> tuple[Run, Parameters]:
-    """A recorded run or a log, and the parameters to replay it with."""
+    """Read a recorded run or a log, and the parameters with which to replay it."""
     run = read_run_or_log(path, options.config, span, options.axis, options.columns)
     run.print_notes('replay')
     if run.parameters is None:
@@ -106,7 +106,7 @@ def _one(path: Path, source: Run, parameters: Parameters, out: Path | None) -> N
         (name, cli.number(recorded.column(name)[-1], 6), *estimate_cells(summary, name)[:2])
         for name in BACKLASH]))
     status, parted = replayed.column('status'), parting(recorded, replayed)
-    if not recorded.has_estimates:  # there is nothing to compare with
+    if not recorded.has_estimates:  # there are no estimates to compare with
         begins = np.append(0, np.flatnonzero(np.diff(status)) + 1)
         states = [f'{Status(int(status[k])).word} from {replayed.column("t")[k]:.3g} s'
                   for k in begins[:8]]

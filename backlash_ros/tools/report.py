@@ -1,4 +1,4 @@
-"""`report`: from a bag or saved results to report.html, figures and summary.json."""
+"""`report`: write report.html, figures and summary.json from a bag or saved results."""
 
 import argparse
 import sys

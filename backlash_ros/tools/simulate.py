@@ -1,4 +1,4 @@
-"""`simulate`: the controller and the plant in one process, once, for many seeds or in a sweep."""
+"""`simulate`: run controller and plant in one process, once, for many seeds, or in a sweep."""
 
 import argparse
 import sys
@@ -43,7 +43,7 @@ def _simulate(args: Sequence[str] | None) -> None:
 
 
 def _once(parameters: Parameters, options: argparse.Namespace) -> None:
-    # Drawing libraries take a second to load, which neither a worker nor bad input should cost.
+    # Imported here, as drawing libraries take a second to load, which workers need not.
     from backlash_ros.tools.report import REPORT_PAGE, write_report
     samples = cli.number_of_samples(parameters, options.duration)
     loop = build_closed_loop(parameters)

@@ -1,1 +1,1 @@
-"""`bringup`: a whole run as processes."""
+"""`bringup`: plan, start, watch and stop the processes of a run."""

@@ -1,9 +1,9 @@
 """One command for a whole run: start the nodes, watch them, stop them, report.
 
-driver: with --driver COMMAND that command runs in the place of the simulated plant, {axis} in it
-being the name of the axis; axes whose commands are the same share one driver. --driver none waits
-for a driver that you start yourself. As a driver moves something real, control.min, control.max and
-control.rate_max have to be set, or --unlimited given.
+driver: with --driver COMMAND that command runs instead of the simulated plant; {axis} in it is
+replaced by the name of the axis, and axes with the same command share one driver. --driver none
+waits for a driver that you start yourself. As a driver moves something real, control.min,
+control.max and control.rate_max have to be set, or --unlimited given.
 
 axes: the parameter axes, in the section /bringup of the file, lists names; each gets nodes of its
 own in the namespace of that name and a folder DIR/NAME. If one axis fails, all are stopped.
@@ -56,7 +56,7 @@ def _end(*_: object) -> None:
 
 def _bringup(arguments: Sequence[str] | None) -> int:
     options = parse_options(arguments)
-    # numpy and scipy take a second to load, and may swallow the exception of a Ctrl-C.
+    # numpy and scipy take a second to load, and may swallow a KeyboardInterrupt.
     before = signal.signal(signal.SIGINT, _end)
     from backlash_ros.tools.bringup.plan import prepare
     from backlash_ros.tools.bringup.watch import report, run

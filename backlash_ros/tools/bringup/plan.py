@@ -1,4 +1,4 @@
-"""From options to a checked plan of a run: its axes, and the processes of each."""
+"""Make a checked plan of a run from its options: its axes, and the processes of each."""
 
 import argparse
 import shlex
@@ -21,8 +21,8 @@ from backlash_ros.tools.cli import BrokenOffError, InputError
 from backlash_ros.tools.config import read_configuration, write_config
 from backlash_ros.tools.runs.files import BAG, CONFIG_FILE, result_directory
 
-ELSEWHERE = 'none'  # the parameter driver where somebody else starts it
-START_DEADLINE_S = 30.0  # for the start of every process, and for the first sample
+ELSEWHERE = 'none'  # value of the parameter driver if the user starts it
+START_DEADLINE_S = 30.0  # for all processes to be ready, and for the first sample
 
 
 def complain(message: str, name: str = 'bringup: ') -> None:
@@ -31,13 +31,12 @@ def complain(message: str, name: str = 'bringup: ') -> None:
 
 @dataclass
 class Axis:
-    """One controller of a run, and how far it has come; name: also its namespace.
+    """One controller of a run and its progress; name: also its namespace.
 
-    Its parameters are complete and checked: samples is 0 without end, driver empty for the
-    simulated plant. made: samples since number first. moved, next_line: on the monotonic clock [s].
-    published: samples and messages by topic of a simulated plant that is done; heard: those of them
-    that the recorder has.
-    """
+    Its parameters are complete and checked: samples is 0 for an endless run, driver '' for the
+    simulated plant. made: samples, counted from `first`. moved, next_line: times of the last
+    progress and the next line, monotonic clock [s]. published: samples and messages by topic, once
+    a simulated plant is done; heard: those that the recorder has."""
 
     name: str
     parameters: Parameters
@@ -61,10 +60,10 @@ class Axis:
 
     @property
     def complete(self) -> bool:
-        """Whether all samples were made, and those of a simulated plant heard.
+        """Whether all samples were made and, if the plant is simulated, recorded.
 
-        A driver does not say how many there were. The middleware sends again what got lost on the
-        way to a recorder that was held up, with its own settings every 3 s.
+        A driver does not say how many there were. What a stalled recorder has missed, the
+        middleware sends again, every 3 s by default.
         """
         p = self.parameters
         if p.driver or self.published is None:
@@ -82,7 +81,7 @@ class Axis:
             return
         self.made, self.moved = made, now
         if now >= self.next_line:
-            # Every 2 s, and ever more seldom, so that a run of days does not fill the disk.
+            # Every 2 s at first, then less and less often: a run of days must not fill the disk.
             self.next_line = now + max(2.0, 0.05 * made * p.sample_period)
             words = [f'{made * p.sample_period:7.2f} s', f'{made}/{p.samples or "∞"}', *(
                 f'{name} {cli.number(progress.get(name))}' for name in topics.BACKLASH
@@ -90,11 +89,11 @@ class Axis:
             complain(self.titled('  '.join(words)), '')
 
     def check_pace(self, unready: Sequence[Child] = ()) -> None:
-        """Raise BrokenOffError if it stands still; unready: its processes that are not ready."""
+        """Raise BrokenOffError if no samples come. unready: its processes that are not ready."""
         p = self.parameters
-        # A driver elsewhere, somebody who activates it or plans the motion may come at any time.
+        # The user may start the driver, activate the controller or plan a motion at any time.
         waits = p.driver == ELSEWHERE or (unready and (not p.autostart or p.joints))
-        # A plant of long periods may take its time.
+        # Long sample periods need more time.
         patience = 10.0 + 2.0 * p.sample_period if self.made else START_DEADLINE_S
         if self.complete or (waits and not self.made) or time.monotonic() < self.moved + patience:
             return
@@ -103,7 +102,7 @@ class Axis:
         if self.made:
             what += f' after sample {self.first + self.made - 1}'
         if p.driver and self.made:
-            # The controller knows what to do when a real plant falls silent; said once.
+            # The controller itself handles a real plant that falls silent; complain once.
             self.moved = inf
             complain(self.titled(f'{what}, waiting for the driver'))
             return
@@ -115,12 +114,12 @@ class Axis:
 
 
 def prepare(options: argparse.Namespace) -> list[Axis]:
-    """The axes of a run: checks all input, then makes the folders of the results."""
+    """Check all input, then make the folders of the results; returns the axes of the run."""
     if ros_is_missing():
         raise BrokenOffError(ROS_MISSING)
     configuration = read_configuration(options.config, options.settings, options.seed)
     names = (options.axis,) if options.axis else configuration.axes or ('',)
-    # Each node takes one of the places that discovery on one machine has; some stay for listeners.
+    # Discovery on one machine has a limited number of places: some are left for listeners.
     if len(names) > 7:
         raise InputError(f'{len(names)} axes are too many for one machine: at most 7')
     parameters: dict[str, Parameters] = {}
@@ -138,7 +137,7 @@ def prepare(options: argparse.Namespace) -> list[Axis]:
                 f'give each axis one of its own, like --set {name}/estimates.file=...')
         if options.out is not None and (options.out / name / BAG).exists():
             raise InputError(f'--out={options.out}: holds a bag already, choose another folder')
-    # The nodes need a path that holds wherever it is read.
+    # The nodes need an absolute path.
     out = result_directory(options.out).resolve()
     axes = [Axis(name, p, out / name) for name, p in parameters.items()]
     for axis in axes:
@@ -151,7 +150,7 @@ def prepare(options: argparse.Namespace) -> list[Axis]:
 
 
 def _checked(p: Parameters, axis: str, options: argparse.Namespace) -> Parameters:
-    """The parameters of an axis with the options, checked as far as is possible without running."""
+    """Parameters of an axis with the options applied, checked as far as possible before a run."""
     driver = (p.driver if options.driver is None else options.driver).strip()
     p = p.replaced({
         'lockstep': options.lockstep or p.lockstep, 'driver': driver.replace('{axis}', axis),
@@ -183,9 +182,9 @@ def _checked(p: Parameters, axis: str, options: argparse.Namespace) -> Parameter
 
 
 def stop_times(axes: Sequence[Axis]) -> tuple[float, float]:
-    """How long to wait after the end of a stage, and beyond the usual time for an end [s]."""
+    """How long to wait after each stage, and how much longer a process may take to end [s]."""
     parameters = [axis.parameters for axis in axes]
-    # The last command of a controller acts from the next sample of its driver on.
+    # The last command of a controller acts only from the next sample of its driver on.
     settling = max(2.0 * p.sample_period * bool(p.driver) for p in parameters)
     return min(settling, 1.0), max(p.timeout.ramp for p in parameters)
 
@@ -193,11 +192,11 @@ def stop_times(axes: Sequence[Axis]) -> tuple[float, float]:
 def plan_processes(
     axes: Sequence[Axis], record: bool = True, live_port: int | None = None,
 ) -> list[list[Child]]:
-    """The processes of a run by stages, which are to be stopped one after the other.
+    """The processes of a run in stages, in the order in which to stop them.
 
-    A simulated plant stops first, so that no output stays without its answer. With a driver the
-    controller goes first and the driver hears its last command. The recorder goes last. live_port:
-    of the page in the browser, 0 for a free one.
+    A simulated plant stops first, so that every output is answered. A driver stops after the
+    controller, so that it hears the last command. The recorder stops last. live_port: of the page
+    in the browser, 0 for a free one, None for no page.
     """
     stages: list[list[Child]] = [[], [], [], []]
     served: dict[str, list[Axis]] = {}
@@ -227,14 +226,14 @@ def plan_processes(
 
 def _node(axis: Axis, name: str, record: bool) -> Child:
     lockstep = axis.parameters.lockstep
-    # In YAML, whatever stands in the path.
+    # Quoted for YAML, whatever the path contains.
     bag = str(axis.out / BAG).replace("'", "''") if record else ''
-    # The loop and the recorder; in real time the reference follows plant_output as well, in
-    # lockstep it follows /clock.
+    # Subscribers of plant_output are controller and recorder and, in real time, the reference,
+    # which follows /clock in lockstep.
     listeners = 3 if name == 'plant' and not lockstep else 2
     arguments = ['--params-file', str(axis.out / CONFIG_FILE), '-p', f"bag:='{bag}'",
                  '-p', 'wait_for_publishers:=true', '-p', f'wait_for_subscribers:={listeners}']
-    if axis.name:  # each axis has a time of its own
+    if axis.name:  # each axis has simulated time of its own
         arguments += ['-r', f'__ns:=/{axis.name}', *['-r', '/clock:=clock'] * lockstep]
     return Child(
         axis.process_name(name),

@@ -1,7 +1,7 @@
-"""Child processes: started together, listened to, stopped in order, none of them left behind.
+"""Start child processes together, take their events, stop them in order, leave none behind.
 
-Every child leads a process group of its own, which no Ctrl-C of the terminal reaches. When the
-supervisor dies, a pipe closes, and this module as a program, the guardian, stops what is left.
+Every child leads a process group of its own, which no Ctrl-C of the terminal reaches. If the
+supervisor dies, a pipe closes, and the guardian, this module as a program, stops what is left.
 """
 
 import json
@@ -24,12 +24,12 @@ import backlash_ros
 from backlash_ros.middleware import prefer_loopback
 from backlash_ros.tools.cli import ONE_THREAD, BrokenOffError
 
-# SIGINT lets a node end as by Ctrl-C; a recorder may need a while to close a large bag.
+# SIGINT ends a node as Ctrl-C does; a recorder may need a while to close a large bag.
 ESCALATION = ((signal.SIGINT, 10.0), (signal.SIGTERM, 3.0), (signal.SIGKILL, 3.0))
 
 
 def child_environment(log_folder: Path, domain: int | str) -> dict[str, str]:
-    """Environment of nodes on this machine; what the user has set stays, except for the domain."""
+    """Environment of nodes on this machine; the user's settings stay, except for the domain."""
     environment = {
         'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', 'ROS_LOG_DIR': str(log_folder / 'ros'),
         **ONE_THREAD, **with_source(os.environ), 'BACKLASH_ROS_EVENTS': '1',
@@ -39,7 +39,7 @@ def child_environment(log_folder: Path, domain: int | str) -> dict[str, str]:
 
 
 def with_source(environment: Mapping[str, str]) -> dict[str, str]:
-    """A copy in which Python finds this package, which need not be installed."""
+    """A copy with which Python finds this package, even if it is not installed."""
     source = str(Path(backlash_ros.__file__).resolve().parents[1])
     # Behind the user's own entries it shadows nothing.
     paths = filter(None, [*environment.get('PYTHONPATH', '').split(os.pathsep), source])
@@ -47,7 +47,7 @@ def with_source(environment: Mapping[str, str]) -> dict[str, str]:
 
 
 def foreign_environment(environment: Mapping[str, str]) -> dict[str, str]:
-    """The same for another program: what ROS 2 wheels have set is for this Python alone."""
+    """The environment for a foreign program, without what the ROS 2 wheels set for this Python."""
     foreign = {name: value for name, value in environment.items() if name != 'BACKLASH_ROS_EVENTS'}
     if foreign.pop('_ROS_WHEELS_BOOTSTRAP_COMPLETE', None):
         foreign['LD_LIBRARY_PATH'] = os.pathsep.join(
@@ -58,19 +58,19 @@ def foreign_environment(environment: Mapping[str, str]) -> dict[str, str]:
 
 @contextmanager
 def free_domain() -> Iterator[int]:
-    """A ROS_DOMAIN_ID that nobody on this machine uses, reserved as long as the context lasts.
+    """A ROS_DOMAIN_ID that nobody on this machine uses, reserved while the context lasts.
 
     Domain d has the UDP ports from 7400 + 250 d on, of which participant n takes 10 + 2 n and
-    11 + 2 n (RTPS 2.5, 9.6.2); a port that no participant ever uses reserves it.
+    11 + 2 n (RTPS 2.5, 9.6.2). It is reserved by a port that no participant ever uses.
     """
-    # These lie below the ports that Linux hands out to others. Starting at the process id spreads
-    # runs that start at the same moment.
+    # Ports of these domains lie below those that Linux assigns freely. The process id spreads runs
+    # that start at the same moment.
     for domain in (1 + (os.getpid() + i) % 101 for i in range(101)):
         port = 7400 + 250 * domain
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as reservation:
             try:
                 reservation.bind(('', port + 5))
-                # As many participants as the discovery range LOCALHOST looks for.
+                # For as many participants as the discovery range LOCALHOST covers.
                 for of_participant in range(port + 10, port + 74, 2):
                     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
                         probe.bind(('', of_participant))
@@ -84,10 +84,10 @@ def free_domain() -> Iterator[int]:
 
 @dataclass(eq=False)
 class Child:
-    """A process; axis: what its events are about.
+    """A process. axis: the axis that its events are about.
 
-    foreign: no node of this package, which tells nothing but by its log. spectator: once it is
-    ready, which it says, the run goes on without it.
+    foreign: it is no node of this package and sends no events. spectator: once it is ready, the run
+    goes on even if it dies.
     """
 
     name: str
@@ -100,8 +100,8 @@ class Child:
     process: subprocess.Popen[bytes] = field(init=False)
 
     def start(self, environment: Mapping[str, str]) -> None:
-        """Raises BrokenOffError for a program that cannot be started."""
-        # A node lets them through when it knows what to do with them: see nodes/__init__.py.
+        """Start the process; raises BrokenOffError if the program cannot be started."""
+        # A node unblocks these signals once it can handle them: see nodes/__init__.py.
         held_back = () if self.foreign else (signal.SIGINT, signal.SIGTERM)
         before = signal.pthread_sigmask(signal.SIG_BLOCK, held_back)
         try:
@@ -117,11 +117,11 @@ class Child:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def pass_on(self, events: 'SimpleQueue[tuple[Child, dict[str, Any]]]') -> None:
-        """Read its output: the events of nodes/runtime/process.py go on, all else is logged."""
+        """Read its output: pass on the events of nodes/runtime/process.py, log all else."""
         assert self.process.stdout is not None
         with self.process.stdout as lines, self.log.open('ab', 0) as log:
             for line in lines:
-                # Whoever is killed may leave half a line.
+                # A process that is killed may leave half a line.
                 if line.startswith(b'{"event": ') and line.endswith(b'}\n'):
                     events.put((self, json.loads(line)))
                 else:
@@ -139,10 +139,10 @@ class Child:
 
 
 class ProcessSupervisor:
-    """Starts processes as a context manager and has stopped all of them when it is left.
+    """Context manager that starts processes on entry, and stops all of them before it exits.
 
-    stages: in the order in which they are to be stopped. hurry: whether nobody gets any more time.
-    pause_s: after the end of a stage. grace_s: beyond the usual time for an end.
+    stages: processes in the order in which they are stopped. hurry: whether to kill them at once.
+    pause_s: wait after each stage. grace_s: time to end in addition to the usual one.
     """
 
     def __init__(
@@ -181,7 +181,7 @@ class ProcessSupervisor:
         self._guardian.communicate()
 
     def events(self, timeout: float) -> Iterator[tuple[Child, dict[str, Any]]]:
-        """What the processes have said; waits up to timeout [s] for a first word."""
+        """Events of the processes; waits up to timeout [s] for the first one."""
         with suppress(Empty):
             yield self._events.get(timeout=timeout)
             while True:
@@ -193,7 +193,7 @@ class ProcessSupervisor:
         for child in self.children:
             child.process.poll()
         for reader in self._readers:
-            reader.join(1.0)  # whoever left the group may keep the output open
+            reader.join(1.0)  # a process that left the group may keep the output open
 
     def _groups(self) -> list[list[int]]:
         """The process groups of each stage, as far as they have been started."""
@@ -205,9 +205,9 @@ def stop_stages(
     stages: Sequence[Sequence[int]], pause_s: float, grace_s: float,
     hurry: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Signal process groups, stage by stage and ever more firmly, until none is alive.
+    """Send process groups, stage by stage, stronger and stronger signals until none is alive.
 
-    hurry: skip to SIGKILL. The rest as in ProcessSupervisor.
+    hurry: whether to skip to SIGKILL. pause_s, grace_s: as in ProcessSupervisor.
     """
     for groups in filter(living, stages):
         for number, patience_s in ESCALATION:
@@ -223,14 +223,14 @@ def stop_stages(
 
 
 def living(groups: Sequence[int]) -> set[int]:
-    """The groups with a process left; a zombie is none, for it may never be collected."""
+    """The groups with a process left; zombies do not count, as they may never be reaped."""
     found = set()
     for stat in Path('/proc').glob('[0-9]*/stat'):
         with suppress(OSError):  # gone meanwhile
             text = stat.read_text(encoding='utf-8', errors='replace')
-            # The name of the program stands in parentheses and may hold anything: proc_pid_stat(5).
+            # The program name, in parentheses, may contain anything: proc_pid_stat(5).
             state, _, group, *others = text.rpartition(')')[2].split()
-            # Where only the main thread has ended, the process is shown as a zombie with threads.
+            # If only the main thread has ended, the process is shown as a zombie with threads.
             if state not in 'XZ' or (state == 'Z' and others[14] != '1'):
                 found.add(int(group))
     return found.intersection(groups)
@@ -239,6 +239,6 @@ def living(groups: Sequence[int]) -> set[int]:
 if __name__ == '__main__':  # the guardian
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
-    # What is to be stopped stands in the last line, which is complete once the supervisor has gone.
+    # The last line says what to stop; it is complete once the supervisor has gone.
     if told := sys.stdin.read().splitlines():
         stop_stages(*json.loads(told[-1]))

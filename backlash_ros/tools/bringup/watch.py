@@ -1,4 +1,4 @@
-"""A run in progress: what its processes say, when it is over, what went wrong, its reports."""
+"""Watch a run: take events of its processes, decide when it is over, report the results."""
 
 import os
 import signal
@@ -21,7 +21,7 @@ from backlash_ros.tools.runs.files import BAG
 def execute(
     axes: Sequence[Axis], supervisor: ProcessSupervisor, requests: StopRequests,
 ) -> str:
-    """Wait until all samples are made, then stop everything; what went wrong, '' if nothing did."""
+    """Wait for all samples, then stop everything; returns what went wrong, '' if nothing did."""
     failure = ''
     try:
         while not (requests.count or all(axis.complete for axis in axes)):
@@ -30,7 +30,7 @@ def execute(
             for axis in axes:
                 axis.check_pace([child for child in supervisor.children
                                  if child.axis is axis and not (child.foreign or child.ready)])
-        # It is the regular end of a run that has no other one.
+        # A signal is the regular end of an endless run.
         endless = any(axis.parameters.samples == 0 for axis in axes)
         if requests.count and not (endless and all(axis.made for axis in axes)):
             raise BrokenOffError(f'interrupted by {requests.last}, stopping')
@@ -43,7 +43,7 @@ def execute(
     take_events(supervisor, 0.0)
     for child in supervisor.children if not failure else ():
         code = child.process.returncode
-        # How a program of the user says good-bye is its own affair.
+        # The exit code of a user's program is its own affair.
         if code and (not child.foreign or code == -signal.SIGKILL):
             failure = child.describe_end('did not stop cleanly')
             complain(failure)
@@ -64,12 +64,12 @@ def take_events(supervisor: ProcessSupervisor, timeout_s: float) -> None:
         elif kind == 'progress':
             axis.take(content)
         elif kind == 'complaint':
-            # The log may lie on the very disk that is full.
+            # Printed, as the log may be on the very disk that is full.
             complain(axis.titled(content['text']))
 
 
 def check_processes(supervisor: ProcessSupervisor) -> None:
-    """Raise BrokenOffError if one without which the run does not go on has died."""
+    """Raise BrokenOffError if a process has died without which the run cannot go on."""
     gone = [child for child in supervisor.children if child.process.poll() is not None]
     if dead := [child for child in gone if not (child.spectator and child.ready)]:
         raise BrokenOffError('\n'.join(child.describe_end('died') for child in dead))
@@ -79,14 +79,14 @@ def check_processes(supervisor: ProcessSupervisor) -> None:
 
 
 def run(axes: Sequence[Axis], record: bool, live_port: int | None) -> str:
-    """Run all processes to the end; what went wrong, '' where nothing did.
+    """Run all processes to the end; returns what went wrong, '' if nothing did.
 
-    Raises BrokenOffError where nothing can start.
+    Raises BrokenOffError if they cannot be started.
     """
     name = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
     domain: int | str = os.environ.get('ROS_DOMAIN_ID', '')
     with StopRequests() as requests, ExitStack() as stack:
-        # Whoever started a driver did so in the domain that is set there, or in none.
+        # A driver that was started elsewhere is in the domain of the environment, or in 0.
         elsewhere = any(axis.parameters.driver == ELSEWHERE for axis in axes)
         domain = domain or (0 if elsewhere else stack.enter_context(free_domain()))
         print(f'to listen in: export ROS_DOMAIN_ID={domain} '
@@ -107,8 +107,8 @@ def run(axes: Sequence[Axis], record: bool, live_port: int | None) -> str:
 
 
 def report(axis: Axis, record: bool) -> bool:
-    """Report what was recorded of an axis; whether it could be."""
-    # Drawing libraries take a second to load: not before bad input is refused.
+    """Write the reports of an axis; returns whether that succeeded."""
+    # Imported here, as drawing libraries take a second to load.
     from backlash_ros.tools.report import REPORT_PAGE, write_report
     from backlash_ros.tools.runs.read_run import read_run
     from backlash_ros.tools.runs.summary import estimate_table

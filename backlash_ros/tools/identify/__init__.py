@@ -1,1 +1,1 @@
-"""`identify`: from a record of v and y to a checked parameter file."""
+"""`identify`: make a checked parameter file from a record of v and y."""

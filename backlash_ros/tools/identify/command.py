@@ -1,4 +1,4 @@
-"""`identify`: one command from a record, or from an actuator, to a checked parameter file."""
+"""`identify`: make a checked parameter file from a record of v and y, or by moving an actuator."""
 
 import argparse
 import os
@@ -13,7 +13,7 @@ from backlash_ros.tools.cli import ONE_THREAD, add_options, run_tool, span_of
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """The options."""
+    """The parser of the options."""
     parser = OptionParser(
         'identify', description=__doc__,
         epilog='Exit codes: 0 the backlash is known, 1 it is not, 2 bad input.')
@@ -21,28 +21,28 @@ def make_parser() -> argparse.ArgumentParser:
                         help='a bag, a folder of results, or a table (CSV and the like, Parquet) '
                              'with the time, the command v and the output y')
     parser.add_argument('--period', type=positive, metavar='S',
-                        help='time from sample to sample [s] (default: told by the stamps)')
+                        help='time from sample to sample [s] (default: from the stamps)')
     parser.add_argument('--config', type=Path, metavar='FILE',
-                        help='parameter file that the result goes on from: limits, topics, axes')
+                        help='parameter file that the result is based on: limits, topics, axes')
     parser.add_argument('--order', type=lambda text: _numbers(text, 6), default=(0, 1, 2, 3, 4),
-                        metavar='N[-N]', help='numbers of poles that are compared (default: 0-4)')
+                        metavar='N[-N]', help='numbers of poles to compare (default: 0-4)')
     parser.add_argument('--delay', type=lambda text: _numbers(text, 40), default=(),
                         metavar='N[-N]',
-                        help='delays that are compared [samples] (default: 0-3, and those up to '
-                             '40 if they fit better)')
+                        help='delays to compare [samples] (default: 0-3, and later ones, up to 40, '
+                             'if they fit better)')
     parser.add_argument('--integrator', choices=('auto', 'no', 'yes'), default='auto',
                         help='whether G has a pole at 1 (default: auto)')
     parser.add_argument('--slope', type=positive, default=1.0, metavar='M',
-                        help='m, a gear ratio for instance; it cannot be told from the gain of G '
-                             '(default: 1)')
+                        help='m, for instance a gear ratio: it cannot be separated from the gain '
+                             'of G (default: 1)')
     add_options(parser, '--columns', '--axis', '--from', '--to', '--out')
     drive = parser.add_argument_group('with --drive')
     drive.add_argument('--drive', action='store_true',
                        help='move the actuator within control.min, control.max and '
                             'control.rate_max of --config, record, bring it to rest, identify')
     drive.add_argument('--precision', type=share, default=0.0, metavar='P%',
-                       help='end the motion as soon as gap and G are known to this (default: 0, '
-                            'the whole duration)')
+                       help='end the motion as soon as gap and G are known this well (default: 0, '
+                            'for the whole duration)')
     add_motion_options(drive, 20.0, 'longest motion')
     return parser
 
@@ -57,7 +57,7 @@ def _numbers(text: str, most: int) -> tuple[int, ...]:
 
 
 def share(text: str) -> float:
-    """An option like 1% or 0.01; argparse reports what is none."""
+    """Type of an option like 1% or 0.01; argparse reports a text that is not."""
     number = float(text.removesuffix('%')) / (100.0 if text.endswith('%') else 1.0)
     if not 0.0 <= number < 1.0:
         raise argparse.ArgumentTypeError(f'{text!r} must be like 1% or 0.01')
@@ -68,7 +68,7 @@ def _identify(args: Sequence[str] | None) -> int:
     os.environ.update({**ONE_THREAD, **os.environ})
     parser = make_parser()
     arguments = list(sys.argv[1:] if args is None else args)
-    # Names of topics are changed as for every node.
+    # Topics can be remapped, as for every node.
     of_ros = arguments.index('--ros-args') if '--ros-args' in arguments else len(arguments)
     options, ros_arguments = parser.parse_args(arguments[:of_ros]), arguments[of_ros:]
     if options.drive == (options.record is not None):
@@ -77,7 +77,7 @@ def _identify(args: Sequence[str] | None) -> int:
         parser.error('--ros-args are for --drive')
     span = span_of(options)
     given: Mapping[str, Value] = {}
-    # numpy, scipy and matplotlib are loaded once the options are known to be right.
+    # numpy, scipy and matplotlib are loaded only once the options are valid.
     if options.config is not None:
         from backlash_ros.tools.config import read_configuration
         configuration = read_configuration(options.config)

@@ -1,4 +1,4 @@
-"""`identify --drive`: lets a node move the actuator, and looks at the record as it grows."""
+"""`identify --drive`: let a node move the actuator, and identify the record while it grows."""
 
 import argparse
 import os
@@ -28,10 +28,10 @@ def drive(
     options: argparse.Namespace, given: Mapping[str, Value], period: float | None,
     ros_arguments: Sequence[str],
 ) -> Record:
-    """Move the actuator and return the record; period [s]: None tells it from the stamps.
+    """Move the actuator and return the record. period [s]: from the stamps if None.
 
-    Raises InputError where it was refused, BrokenOffError where it was interrupted, where nothing
-    came, or without ROS 2.
+    Raises InputError if the node refused to move it, BrokenOffError if it was interrupted, if there
+    is no record, or without ROS 2.
     """
     if ros_is_missing():
         raise BrokenOffError(ROS_MISSING)
@@ -48,8 +48,8 @@ def drive(
                 command += [f'--{name.replace("_", "-")}', *map(str, values)]
         enough, sent = threading.Event(), 0
         threading.Thread(target=_look, args=(path, period, options, enough), daemon=True).start()
-        # A group of its own: a Ctrl-C reaches this process alone, which passes it on. With the
-        # first one, or when enough is known, the node comes to rest; with a further one it holds v.
+        # In a group of its own: Ctrl-C reaches only this process, which passes it on. At the first
+        # one, or once enough is known, the node brings v to rest; at a second one it holds v.
         child = subprocess.Popen([*command, *ros_arguments], start_new_session=True,
                                  stdout=sys.stderr)
         while child.poll() is None:
@@ -70,12 +70,12 @@ def drive(
 
 
 def _record(path: Path, period: float | None) -> Record | None:
-    """The record of what the node has written so far, None while it is none yet.
+    """The record of the messages that the node has written so far; None if there are too few.
 
-    On each line of the file: topic, stamp [ns], value.
+    Each line of the file holds topic, stamp [ns] and value.
     """
     heard: dict[str, list[tuple[int, float]]] = {}
-    *lines, _ = path.read_text(encoding='ascii').split('\n')  # the last one is yet to be ended
+    *lines, _ = path.read_text(encoding='ascii').split('\n')  # the last may be incomplete
     for line in lines:
         topic, stamp, value = line.split(',')
         heard.setdefault(topic, []).append((int(stamp), float(value)))
@@ -88,18 +88,18 @@ def _record(path: Path, period: float | None) -> Record | None:
 def _look(
     path: Path, period: float | None, options: argparse.Namespace, enough: threading.Event,
 ) -> None:
-    """Tell now and then what the record says, until enough is known, which may be told here.
+    """Identify the growing record now and then and print the result, until enough is known.
 
-    It is identified beside the motion, by a thread that gives way to the driver.
+    Sets `enough` at --precision. It runs in a thread of lower priority than the driver.
     """
     def go_on(_: str) -> None:
         if enough.is_set():
-            raise BrokenOffError('nobody asks for the estimate any more')
+            raise BrokenOffError('the estimate is no longer needed')
 
     os.nice(5)
     next_look = 3.0  # [s] of motion before an estimate
     while not enough.wait(0.25):
-        # The file is gone as well once nobody asks any more.
+        # When the motion ends, the file is deleted as well.
         with suppress(BrokenOffError, FileNotFoundError):
             record = _record(path, period)
             moved = len(record.v) * record.sample_period if record else 0.0

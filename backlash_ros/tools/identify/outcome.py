@@ -1,4 +1,4 @@
-"""From a measured record to the files of a result, the page, and what the terminal shows of it."""
+"""Identify a measured record; write the files of the result and the page; print the outcome."""
 
 import argparse
 import signal
@@ -30,7 +30,7 @@ YAML = 'identified.yaml'
 def identify_record(
     record: Record, options: argparse.Namespace, progress: Callable[[str], object],
 ) -> Identification:
-    """Identify with what the command line says; raises BrokenOffError."""
+    """Identify a record with the options of the command line; raises BrokenOffError."""
     integrators = {'auto': (False, True), 'yes': (True,), 'no': (False,)}[options.integrator]
     try:
         found = identify(record.v, record.y, record.sample_period, Options(
@@ -48,7 +48,7 @@ def write_outcome(
     out = result_directory(options.out)
     estimates, text = out.resolve() / 'estimates.json', None
     if found.usable:
-        estimates.unlink(missing_ok=True)  # of a record before, if any
+        estimates.unlink(missing_ok=True)  # of an earlier record, if any
         try:
             parameters = identified_parameters(found, given, estimates)
             text = commented_yaml(parameters, found, record.source, options.axis)
@@ -80,9 +80,8 @@ def write_outcome(
 
 
 def _pictures(found: Identification) -> Iterator[Picture]:
-    """By them a person judges whether the result is to be trusted; none where nothing was fitted.
-    """
-    # A Ctrl-C waits while Matplotlib is loaded, which would take it for a part that is missing.
+    """Figures by which a person can judge the result; none if nothing was fitted."""
+    # Ctrl-C has to wait until Matplotlib is loaded, which would take it for a failed import.
     signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT,))
     from backlash_ros.tools import figures
     signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT,))
@@ -109,14 +108,14 @@ def _pictures(found: Identification) -> Iterator[Picture]:
 
 
 def write_record(record: Record, path: Path) -> None:
-    """Write t, v, y, and the commands where they are others, as a CSV that `identify` reads."""
+    """Write t, v, y, and the commands if they differ from v, as a CSV that `identify` reads."""
     columns = [record.sample_period * np.arange(len(record.v)), record.v, record.y, record.commands]
     rows = np.column_stack([values for values in columns if values is not None]).tolist()
     write_table(path, (*ROLES, COMMAND)[:len(rows[0])], rows)
 
 
 def _facts(found: Identification, record: Record) -> list[tuple[str, str]]:
-    """What was found besides the backlash, by name, for the terminal and the page."""
+    """What was found besides the backlash, as (name, text), for the terminal and the page."""
     g = found.model
     told = [('time', record.timing), ('lost samples, outliers', f'{record.lost}, {g.outliers}')]
     if found.details is not None:
@@ -141,17 +140,17 @@ def _facts(found: Identification, record: Record) -> list[tuple[str, str]]:
 def identified_parameters(
     found: Identification, given: Mapping[str, Value], estimates: Path | None = None,
 ) -> Parameters:
-    """The complete set: what was found, in what the user has given, and defaults for the rest.
+    """The complete set: identified values, others as the user gave them, defaults for the rest.
 
-    estimates: file of what the controller is to begin with. Raises ParameterError where the
-    controller does not take it.
+    estimates: file with which the controller is to start. Raises ParameterError if the controller
+    does not accept the set.
     """
-    # Parameters of the file that the user gave which do not go on: of the simulation, of one run,
-    # and of an actuator, which is outdated where v is the command.
+    # Given parameters that are not taken over: of the simulation, of a single run, and of an
+    # actuator, which is outdated if v is the command.
     not_taken_over = (
         'truth', 'backlash', 'output_noise_std', 'output_quantum', 'input_disturbance', 'estimates',
         'bag', 'lockstep', 'wait_for_subscribers', 'wait_for_publishers', 'axes', 'actuator')
-    wider = 3.0  # bounds of the estimates, in times of what was found
+    wider = 3.0  # bounds of the estimates, as multiples of what was found
     assert found.details is not None
     reach = max(abs(found.c_r), abs(found.c_l)) + found.std['c_r']
     scale = _short(max(wider * max(found.gap, reach), 1e-9))
@@ -162,10 +161,10 @@ def identified_parameters(
         actuator = {'actuator.numerator': tuple(lag.numerator.tolist()),
                     'actuator.denominator': tuple(lag.denominator.tolist()),
                     'actuator.wind_up': (_short(right, 6), _short(left, 6))}
-    # Digits that the swing bears, wherever 0 of v is.
+    # Decimal places by the swing of v, wherever its zero is.
     digits = 3 - int(np.floor(np.log10(np.ptp(found.v))))
     values: dict[str, Any] = {
-        # v as far and as fast as it went in the record, and no further, where no limit is given.
+        # Unless limits are given, v may go as far and as fast as it did in the record.
         'control.min': round(float(found.v.min()), digits),
         'control.max': round(float(found.v.max()), digits),
         'control.rate_max': _short(np.abs(np.diff(found.v)).max() / found.sample_period, 4),
@@ -183,14 +182,14 @@ def identified_parameters(
         'estimator.bounds.m': (_short(found.m / wider), _short(found.m * wider)),
         'estimator.bounds.c_r': (-scale, scale), 'estimator.bounds.c_l': (-scale, scale),
         'estimator.output_noise_std': _short(max(g.noise_std, 1e-12)),
-        # The simulated plant is the one that was found, so that the file can be tried out.
+        # The simulated plant is the identified one, so that the file can be tried out.
         'backlash.m': found.m, 'backlash.c_r': c_r, 'backlash.c_l': c_l,
         'output_quantum': _short(g.quantum, 6),
         'output_noise_std': 0.0 if g.quantum else _short(g.noise_std),
         **({'estimates.file': str(estimates), 'estimates.load': True} if estimates else {}),
     }
     if 'structure' not in given:
-        # y follows y_m where gains for that can be designed, else u_d = y_m.
+        # tracking, if gains for it can be designed, else u_d = y_m.
         try:
             return _accepted({**values, 'structure': 'tracking'})
         except (ValueError, ArithmeticError, np.linalg.LinAlgError):
@@ -200,7 +199,7 @@ def identified_parameters(
 
 def _accepted(values: Mapping[str, Any]) -> Parameters:
     parameters = Parameters(values)
-    # estimates.file is yet to be written, perhaps over that of another record.
+    # From first_guess, as estimates.file is not written yet.
     build_controller(parameters, first_guess(parameters))
     return parameters
 
@@ -210,7 +209,7 @@ def _short(value: float, digits: int = 3) -> float:
 
 
 def _reference(found: Identification, details: Details) -> dict[str, Value]:
-    """A reference that the actuator can follow, and that shows the gap."""
+    """Parameters of a reference that the actuator can follow and that crosses the gap."""
     y = found.y[np.isfinite(found.y)]
     middle = 0.0 if found.model.integrator else 0.5 * float(np.percentile(y, [5, 95]).sum())
     gain = float(np.abs(details.response.at(found.model.frequencies[:1]))[0])
@@ -222,26 +221,26 @@ def _reference(found: Identification, details: Details) -> dict[str, Value]:
 
 
 def _weights(found: Identification, details: Details) -> dict[str, Value]:
-    """The usual weight of u, at a frequency where G is known and v still moves y."""
-    # To the frequency [rad/sample] at which tracking.input_weight takes |G|.
+    """Tracking parameters with the usual weight of u at a frequency where G is known and large."""
+    # Up to the frequency [rad/sample] at which tracking.input_weight refers to |G|.
     w = np.linspace(found.model.frequencies[0], np.pi / 10.0, 200)
     gain = np.abs(details.response.at(w))
     if found.actuator is not None:
         gain = gain * np.abs(found.actuator.lag.response(np.exp(1j * w)))
-    # Beyond a tenth of the gain at the lowest frequency motion of y takes too much of v.
+    # Below a tenth of the gain at the lowest frequency, motion of y needs too much v.
     beyond = np.flatnonzero((w > details.response.known_up_to) | (gain < 0.1 * gain[0]))
     if not len(beyond):
         return {}
     last, usual = max(int(beyond[0]) - 1, 0), Parameters().tracking
     return {
         'tracking.input_weight': _short(usual.input_weight * max(gain[last] / gain[-1], 1.0)**2, 2),
-        # Nearly a period of that motion.
+        # Nearly one period of motion at that frequency.
         'tracking.preview': min(max(round(6.0 / w[last]), usual.preview), 600)}
 
 
 def as_estimate(found: Identification, parameters: Parameters) -> Estimate:
-    """What a controller may begin with, as if it had learned it itself."""
-    # A deviation of 0 would say that a constant was given.
+    """The estimate with which a controller can start, as if it had learned it itself."""
+    # A standard deviation of 0 would mean that the constant is given.
     least = 1e-6 * max(found.gap, abs(found.c_r), abs(found.c_l))
     initial = parameters.estimator.initial
     return Estimate(
@@ -278,16 +277,16 @@ def numbers(found: Identification) -> dict[str, Any]:
 def commented_yaml(
     parameters: Parameters, found: Identification, source: str, axis: str = '',
 ) -> str:
-    """A parameter file that says of each value what it is and, where it was found, how surely."""
+    """Text of a parameter file with a comment for each value, and the ± of those identified."""
     band, std = found.hertz, found.std
     comments = {
         'plant.numerator': f'G to ± {100.0 * found.model.response_std.max():.2g} % from '
                            f'{band[0]:.2g} to {band[-1]:.2g} Hz; its gain is that for m = '
                            f'{found.m:g}, ± {100.0 * std["m"] / found.m:.2g} %',
-        'estimator.initial.m': 'as told with --slope, 1 where it was not: G has the gain for it',
+        'estimator.initial.m': 'as given with --slope, 1 if it was not: G has the gain for it',
         'estimator.initial.c_r': f'± {std["c_r"]:.2g} [v]',
         'estimator.initial.c_l': f'± {std["c_l"]:.2g} [v]',
-        'estimator.output_noise_std': 'deviation of y from the simulation [y]',
+        'estimator.output_noise_std': 'rms deviation of y from the simulation [y]',
     }
     lines = [
         f'# Identified from {source}: {len(found.y)} samples of {found.sample_period:g} s.',

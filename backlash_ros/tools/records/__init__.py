@@ -1,1 +1,1 @@
-"""Logs of any kind: tables of text, Parquet, bags, results; what their columns are."""
+"""Read logs of any kind, text tables, Parquet, bags and results, and recognise their columns."""

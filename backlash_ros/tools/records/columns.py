@@ -1,12 +1,12 @@
-"""Which column is the time, which one the command v, which one the output y, by their names."""
+"""Recognise the columns of time, command v and output y by their names."""
 
 import re
 from collections.abc import Mapping, Sequence
 
 ROLES = ('t', 'v', 'y')
-COMMAND = 'command'  # a fourth one, where v is what a motor encoder reports
+COMMAND = 'command'  # a fourth one, if v is what a motor encoder reports
 
-# Words of names, surest first; of the first line that fits any column, the column is taken.
+# Patterns of names, most certain first: the first that fits any column decides.
 PATTERNS: Mapping[str, Sequence[str]] = {
     't': (
         r't', r'time|timestamp|time stamp|stamp|uhrzeit',
@@ -27,7 +27,7 @@ PATTERNS: Mapping[str, Sequence[str]] = {
         r'(.* )?(positions?|pos|output|encoder|angle|theta|q)( .*)?|.* y',
     ),
 }
-# What is neither v nor y, whatever else its name says.
+# Names that are neither v nor y, whatever else they contain.
 OTHERS = r'.*\b(qd|dq|speed|velocity|vel|(load|current)(?! (pos(ition)?|angle|encoder))|torque' \
          r'|effort|temp(erature)?|voltage|status|moving|err(or)?|acceleration|acc|power|rate' \
          r'|direction|duration)\b.*'
@@ -39,7 +39,7 @@ UNITS_S = {unit: scale for scale, units in {
 
 
 def parse_columns(text: str) -> dict[str, str]:
-    """`t=NAME,v=NAME,y=NAME`, in any order, as a dictionary; raises ValueError."""
+    """Parse `t=NAME,v=NAME,y=NAME`, in any order, into names by role; raises ValueError."""
     parts = re.split(rf'(?:^|,)\s*({"|".join((*ROLES, COMMAND))})=', text)
     if parts[0] or len(parts) < 3:
         raise ValueError(f'{text!r} must be like t=NAME,v=NAME,y=NAME')
@@ -50,10 +50,10 @@ def parse_columns(text: str) -> dict[str, str]:
 
 
 def choose_columns(names: Sequence[str], given: Mapping[str, str]) -> tuple[dict[str, str], str]:
-    """The columns of a table with these names by role, and what was guessed, '' for nothing.
+    """Choose the columns of a table by role; also returns what was guessed as text, or ''.
 
-    given: by role, as the user says. Raises RecordError that names the columns where one is missing
-    or several may be meant.
+    given: columns by role that the user has chosen. Raises RecordError, with the names of all, if a
+    role fits no column or several.
     """
     from backlash_ros.core.records.record import RecordError  # loads NumPy
 
@@ -66,7 +66,7 @@ def choose_columns(names: Sequence[str], given: Mapping[str, str]) -> tuple[dict
             continue
         fitting = _fitting(role, names, found)
         if not fitting and role != 't' and len(names) == 3:
-            # The one of three that is nothing else, nor the other one of v and y.
+            # Of three columns the one that is left over.
             neither = {*found.values(), *_fitting('y' if role == 'v' else 'v', names, found)}
             left = [name for name in names
                     if name not in neither and not re.fullmatch(OTHERS, _words(name))]
@@ -85,20 +85,20 @@ def choose_columns(names: Sequence[str], given: Mapping[str, str]) -> tuple[dict
 
 
 def columns_of(names: Sequence[str]) -> str:
-    """What columns there are, in words."""
+    """The names of the columns, in words."""
     shown = ', '.join(names[:14]) + (f', … ({len(names)} in all)' if len(names) > 14 else '')
     return f'the columns are {shown}'
 
 
 def unit_of(name: str) -> float | None:
-    """Unit [s] of the time that a name tells, like `Time [ms]` or `stamp_ns`; None for none."""
+    """Unit [s] in the name of a time column, as in `Time [ms]` or `stamp_ns`; None if none."""
     bracketed = re.search(r'[\[(]\s*([^\])]+?)\s*[\])]', name)
     word = bracketed.group(1) if bracketed else re.split(r'[\s_.]', name.strip())[-1]
     return UNITS_S.get(word.lower())
 
 
 def _fitting(role: str, names: Sequence[str], taken: Mapping[str, str]) -> list[str]:
-    """Columns that may be this, of the surest pattern that fits any."""
+    """Columns that may have this role, by the most certain pattern that fits any."""
     words = {name: _words(name) for name in names if name not in taken.values()}
     found = ([name for name, text in words.items() if re.fullmatch(pattern, text)
               and (role == 't' or not re.fullmatch(OTHERS, text))] for pattern in PATTERNS[role])

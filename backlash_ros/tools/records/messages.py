@@ -1,4 +1,4 @@
-"""A record from messages of v and y: of a bag, or of an actuator that is being moved."""
+"""Make a record from messages of v and y, of a bag or of an actuator that is being moved."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -17,11 +17,11 @@ from backlash_ros.tools.runs.read_run import choose_namespace, read_topics, topi
 
 Messages = Sequence[tuple[int, float]]  # stamps [ns] and values
 
-FEWEST_MESSAGES = 3  # that are a motion
+FEWEST_MESSAGES = 3  # needed for a motion
 
 
 class Signal(NamedTuple):
-    """Numbers of one topic, or of one joint of it. commanded: v, by the name of the topic."""
+    """Values of a topic, or of a joint in it. commanded: whether the topic is named like v."""
 
     messages: list[tuple[int, float]]
     commanded: bool
@@ -31,13 +31,13 @@ class Signal(NamedTuple):
 def read_bag_record(
     path: Path, period: float | None, axis: str, columns: Mapping[str, str],
 ) -> Record | None:
-    """v and y of a bag: topics of this package, or joint states and commands to joints.
+    """Read v and y of a bag: topics of this package, or joint states and commands to joints.
 
-    axis: of several, the namespace or the joint. columns: names of the signals that are v and y.
-    None where only the signals of a controller tell them: stamps of a simulated time do not say
-    what came first within a sample. Raises InputError and RecordError.
+    axis: one of several namespaces or joints. columns: names of the signals v and y. Returns None
+    if only the controller's signals tell v and y: stamps of simulated time do not tell the order
+    within a sample. Raises InputError and RecordError.
     """
-    simulated_before_ns = 10**17  # stamps: the clock of a machine is far beyond
+    simulated_before_ns = 10**17  # stamps of real clocks are far beyond
     signals, damage = _signals(path)
     of_joints = any(each.joint or each.commanded for each in signals.values())
     native = any(topic_ends_like(name, topics.PLANT_OUTPUT) for name in signals)
@@ -57,10 +57,10 @@ def read_bag_record(
 
 
 def from_messages(heard: Mapping[str, Messages], period: float | None, of_axis: str = '') -> Record:
-    """From stamps [ns] and values by topic, plant_output among them.
+    """Make a record of stamps [ns] and values by topic, plant_output among them.
 
-    v is that of applied_control where it is reported, else that of control. period [s]: from sample
-    to sample, None tells it from the stamps. Raises RecordError.
+    v is that of applied_control if it is reported, else that of control. period [s]: from the
+    stamps if None. of_axis: for messages. Raises RecordError.
     """
     said, notes = list[str](), list[str]()
     begin_ns = int(np.median([stamp for stamp, _ in heard[topics.PLANT_OUTPUT]]))
@@ -83,7 +83,7 @@ def from_messages(heard: Mapping[str, Messages], period: float | None, of_axis: 
         record = replace(record, v=without_origin(record.v, record.commands))
     for topic, (times, _) in sent.items():
         lost = np.count_nonzero((t > times[0] - step) & (t <= times[-1])) - len(times)
-        # A topic with fewer messages is published on change.
+        # A topic with even fewer messages is published on change only.
         if TROUBLE * (lost + len(times)) < lost < 0.5 * (lost + len(times)):
             notes.append(f'{lost} messages of {topic} are missing: the one before is taken for '
                          'them')
@@ -94,7 +94,7 @@ def from_messages(heard: Mapping[str, Messages], period: float | None, of_axis: 
 
 
 def _native(signals: Mapping[str, Signal], axis: str) -> tuple[dict[str, Messages], str]:
-    """The topics of this package by their own names, and which other axes there are."""
+    """Messages by topic of this package, and a note on other axes."""
     chosen, about = dict[str, Messages](), ''
     for topic in (topics.PLANT_OUTPUT, topics.CONTROL, topics.APPLIED_CONTROL):
         ends = sorted(name for name in signals if topic_ends_like(name, topic))
@@ -109,7 +109,7 @@ def _native(signals: Mapping[str, Signal], axis: str) -> tuple[dict[str, Message
 def _joint_pair(
     signals: Mapping[str, Signal], axis: str, columns: Mapping[str, str],
 ) -> tuple[str, str]:
-    """Names of v and y; raises RecordError where they cannot be told."""
+    """The names of the signals v and y; raises RecordError if they are ambiguous."""
     names = ', '.join(sorted(signals)) or 'none'
     for name in columns.values():
         if name not in signals:
@@ -127,9 +127,9 @@ def _joint_pair(
 
 
 def _signals(path: Path) -> tuple[dict[str, Signal], str]:
-    """Every number of a bag that may be v or y, by name, and what is wrong with the bag."""
+    """All signals of a bag that may be v or y, by name, and its damage or ''."""
     array = 'std_msgs/msg/Float64MultiArray'
-    # What is added to the name of the topic, the joint, and the value of each number of a message.
+    # For each number in a message: what to append to the topic, the joint, the value.
     numbers_of: Mapping[str, Callable[[Any], Sequence[tuple[str, str, float]]]] = {
         'std_msgs/msg/Float64': lambda message: [('', '', message.data)],
         array: lambda message: [(f'[{k}]', '', value) for k, value in enumerate(message.data)],

@@ -1,4 +1,4 @@
-"""A record from whatever a user has: a table, a folder of results, a bag; or the same as a run."""
+"""Read a record from a table, a folder of results or a bag; or read any of these as a run."""
 
 from collections.abc import Mapping
 from contextlib import suppress
@@ -25,8 +25,8 @@ def read_record(
 ) -> Record:
     """Read a table (CSV or the like, Parquet), a folder of results or a bag.
 
-    period [s]: from sample to sample, None tells it from the record. columns: names by role (t, v,
-    y, command); of a bag those of its signals. Raises InputError, in one line.
+    period [s]: of the samples, from the record if None. columns: names by role (t, v, y, command)
+    of the columns, or of the signals of a bag. Raises InputError, in one line.
     """
     if not path.exists():
         raise InputError(f'{path}: does not exist')
@@ -49,7 +49,7 @@ def _from_table(path: Path, period: float | None, given: Mapping[str, str]) -> R
 
 
 def _from_run(path: Path, period: float | None, axis: str, columns: Mapping[str, str]) -> Record:
-    # What reads bags takes half a second to load.
+    # Imported here, as these modules take half a second to load.
     from backlash_ros.tools.records.messages import read_bag_record
     from backlash_ros.tools.runs.read_run import find_bag, read_run
     bag = find_bag(path)
@@ -63,7 +63,7 @@ def _from_run(path: Path, period: float | None, axis: str, columns: Mapping[str,
 
 
 def _is_table(path: Path) -> bool:
-    no_tables = ('.npz', '.mcap', '.db3', '.zstd', '.zst')  # files of results and bags
+    no_tables = ('.npz', '.mcap', '.db3', '.zstd', '.zst')  # of results and bags
     return path.is_file() and path.suffix.lower() not in no_tables
 
 
@@ -71,9 +71,9 @@ def read_run_or_log(
     path: Path, config: Path | None = None, span: Span = WHOLE_SPAN, axis: str = '',
     columns: Mapping[str, str] = NO_COLUMNS,
 ) -> Run:
-    """A run of this package; or a log, as `read_record` takes it, as a run without estimates.
+    """Read a run of this package, or any log for `read_record` as a run without estimates.
 
-    config: parameters, by default those beside a run. Raises InputError.
+    config: parameter file; that beside the run if None. Raises InputError.
     """
     from backlash_ros.tools.runs.read_run import find_bag, read_run
     no_run: InputError | None = None
@@ -89,7 +89,7 @@ def read_run_or_log(
             no_run = error
     parameters = None if config is None else read_configuration(config).parameters(axis)
     period, record = None if parameters is None else parameters.sample_period, None
-    with suppress(InputError):  # as `identify` takes it, if that fits
+    with suppress(InputError):  # as `identify` reads it, if the period fits
         record = read_record(path, None, span, axis, columns)
     try:
         if record is None or (period and abs(record.sample_period / period - 1.0) >= 0.01):
@@ -98,7 +98,7 @@ def read_run_or_log(
         raise no_run or error from None
     known = np.flatnonzero(np.isfinite(record.y))
     applied = [[], *(part.tolist() for part in np.split(record.v, known)[1:-1])]
-    # A log names no reference, and what is learned does not depend on it.
+    # A log has no reference, on which learning does not depend.
     rows = rows_of({'t': record.sample_period * (known - known[0]), 'y_m': record.y[known],
                     'y': record.y[known], 'v': record.v[known]})
     run_record = RunRecord(

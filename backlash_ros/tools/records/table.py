@@ -1,7 +1,7 @@
-"""A table of numbers from a file: text with any separator and any head, or Parquet.
+"""Read a table of numbers from a file: text with any separator and any head, or Parquet.
 
-Where the head ends, which sign separates, which one is the decimal sign: pandas and polars have to
-be told as well, and are larger than all else that this package needs.
+pandas and polars do not find the end of the head, the separator or the decimal sign by themselves
+either, and are larger than all else that this package needs.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.records.record import RecordError, counted
 from backlash_ros.tools.records.columns import UNITS_S, columns_of, unit_of
 
-MOST_BROKEN = 0.1  # share of the lines that may be broken, and of the cells that are no number
+MOST_BROKEN = 0.1  # share of lines that may be broken, and of cells that may be no number
 NO_NUMBER = {'', 'nan', 'null', 'none', 'na', 'n/a', '-', '--', 'nil', '?', '#n/a', 'bad',
              'missing', 'nat'}
 COMMENT = re.compile(r'^\s*(?:[#%]|//)[#%/ \t]*')
@@ -37,29 +37,29 @@ DATE_AND_TIME = re.compile(
 
 
 class Table(NamedTuple):
-    """Cells by the names in the head, or '1', '2', …; whether the comma is the decimal sign."""
+    """Cells by name of the column, or '1', '2', …. comma: whether it is the decimal sign."""
 
     columns: Mapping[str, Sequence[str]]
     comma: bool = False
     notes: tuple[str, ...] = ()
 
     def times(self, name: str) -> tuple[Array, float | None]:
-        """Stamps (N,), and their unit [s] where the file tells it; raises RecordError."""
+        """Stamps (N,), and their unit [s] or None if the file does not tell; raises RecordError."""
         dates = times_of(self.columns[name])
         if np.isfinite(dates).mean() > 0.5:
             return dates, 1.0
         t = self.numbers(name, 'time')
         if re.fullmatch('date|datum', name.lower()) and 2e4 < np.nan_to_num(t).max() < 1e5:
-            return t, 86400.0  # of a table calculation
+            return t, 86400.0  # dates of a spreadsheet
         for other in self.columns:
-            # In two columns, as in headers of ROS messages.
+            # Seconds and nanoseconds in two columns, as in headers of ROS messages.
             whole, nanoseconds = re.subn('n(ano)?(?=secs?$)', '', other)
             if nanoseconds and whole.rstrip('s') == name.rstrip('s'):
                 return t + 1e-9 * self.numbers(other), 1.0
         return t, unit_of(name)
 
     def numbers(self, name: str, what: str = 'number') -> Array:
-        """A column as numbers (N,), nan where there is none; raises RecordError."""
+        """A column as numbers (N,), nan for cells without one; raises RecordError."""
         cells = self.columns[name]
         values = np.array([_number(cell, self.comma) for cell in cells], dtype=float)
         broken = [k for k in np.flatnonzero(np.isnan(values)) if cells[k].lower() not in NO_NUMBER]
@@ -71,7 +71,7 @@ class Table(NamedTuple):
         return values
 
     def by_name(self) -> Table:
-        """With a column for each name that stands in a cell, where a row has one value."""
+        """If rows hold a name and a value, the table with a column for each such name."""
         columns = dict(self.columns)
         of_values = [name for name in columns
                      if re.fullmatch('.*(value|data|reading)', name.lower())]
@@ -88,7 +88,7 @@ class Table(NamedTuple):
 
 def _number(cell: str, comma: bool) -> float | None:
     if ',' in cell:
-        # What stands last is the decimal sign where both occur.
+        # If both occur, the last one is the decimal sign.
         decimal = cell.rfind(',') > cell.rfind('.') if '.' in cell else comma
         cell = cell.replace('.', '').replace(',', '.') if decimal else cell.replace(',', '')
     try:
@@ -98,7 +98,7 @@ def _number(cell: str, comma: bool) -> float | None:
 
 
 def times_of(cells: Sequence[str]) -> Array:
-    """Seconds (N,) of dates, or of times of day, all of one zone; nan for what is none."""
+    """Seconds (N,) of dates and times, or times of day, all in one zone; nan for other cells."""
     found = [DATE_AND_TIME.fullmatch(cell) for cell in cells]
     parts = [each.groups('') if each else ('', '', '') for each in found]
     dates = [re.sub('[/ ]', '-', date) for date, _, _ in parts]
@@ -109,7 +109,7 @@ def times_of(cells: Sequence[str]) -> Array:
 
 
 def _days(dates: Iterable[str]) -> Mapping[str, float]:
-    """Seconds from 1970 to each; of 3/4/2024 what is the day is told by all of them."""
+    """Seconds from 1970 to each date; all of them together tell what is the day in 3/4/2024."""
     found = [dict[str, float]() for _ in DATES]
     for days, form in zip(found, DATES, strict=True):
         for date in dates:
@@ -128,7 +128,7 @@ def _time_of_day(time: str, half: str) -> float:
 
 
 def read_table(path: Path) -> Table:
-    """The table of a file; raises RecordError, in one line."""
+    """Read the table in a file; raises RecordError, in one line."""
     try:
         data = path.read_bytes()
         if data[:2] == b'\x1f\x8b':
@@ -157,19 +157,19 @@ def _from_text(text: str) -> Table:
     if not count or not any(data):
         raise RecordError(
             'holds no table: give rows of numbers with t, v and y, separated by , ; or tabs')
-    # From the middle upwards: a table may stand below other ones.
+    # Search the head from the middle upwards, as other tables may stand above this one.
     first = np.flatnonzero(data)[sum(data) // 2]
     wide = max(2, sum(map(bool, rows[first])) - 1)
     heads = [row for row in rows[:first]
              if sum(map(bool, row)) >= wide and not _is_numeric(row)] or [[]]
     head, units = heads[-1], list[str]()
-    # A head that comes again belongs to the same table.
+    # rows.index finds the first of repeated heads: all belong to the same table.
     at = rows.index(head) if head in rows else -1
     if at > 0 and rows[at - 1] in heads and _are_units(head):
         head, units = rows[at - 1], head
     empty = [''] * count
     names = [cell or str(k + 1) for k, cell in enumerate([*head, *empty][:count])]
-    # A second one of a name with its number.
+    # A repeated name gets a number.
     names = [f'{name} ({names[:k].count(name) + 1})' if name in names[:k] else name
              for k, name in enumerate(names)]
     names = [f'{name} [{unit.strip("[]() ")}]' if unit else name
@@ -201,8 +201,8 @@ def _split(line: str, separator: str) -> list[str]:
 
 
 def _separator(lines: Sequence[str]) -> tuple[str, int]:
-    """What separates the cells, and how many a row has; 0 where there is no table."""
-    looked_at = 200  # lines by which the separator is told, from the middle of the file
+    """The separator, and the number of cells in a row, 0 if there is no table."""
+    looked_at = 200  # lines in the middle of the file that are looked at
     begin = max(len(lines) // 2 - looked_at // 2, 0)
     part = [line for line in lines[begin:begin + looked_at] if re.search(r'\d', line)]
     best, most = (',', 0), 0.5
@@ -210,7 +210,7 @@ def _separator(lines: Sequence[str]) -> tuple[str, int]:
         rows = (_split(line, separator) for line in part)
         counts = Counter(len(row) for row in rows if len(row) > 1 and _is_numeric(row))
         for count, times in counts.most_common(1):
-            # The first of those that explain as much: a comma may be a decimal sign.
+            # Of those that explain as much, the first: a comma may be a decimal sign.
             if times / len(part) > 1.05 * most:
                 best, most = (separator, count), times / len(part)
     return best

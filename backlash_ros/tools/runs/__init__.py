@@ -1,1 +1,1 @@
-"""Runs: read from bags and folders of results, judged, written."""
+"""Read runs from bags and folders of results, summarise and write them."""

@@ -1,4 +1,4 @@
-"""A run, and its files: its folder, samples.csv, record.npz, summary.json."""
+"""A run and its files: the folder, samples.csv, record.npz, summary.json."""
 
 import csv
 import io
@@ -27,10 +27,10 @@ SAMPLE_COLUMNS = (*COLUMNS[:COLUMNS.index('u_hat')], 'status')
 
 
 class Run(NamedTuple):
-    """A run that was simulated or recorded; parameters are None where they are unknown.
+    """A simulated or recorded run; parameters: None if they are unknown.
 
-    notes: on the source, a sentence each. applied: the v that acted since the row before, for each
-    row, as far as the driver or a log tells it; empty for nothing.
+    notes: on the source, a sentence each. applied: for each row, the v that acted since the row
+    before, if the driver or a log tells it; else empty.
     """
 
     record: RunRecord
@@ -39,14 +39,14 @@ class Run(NamedTuple):
     applied: Sequence[Sequence[float]] = ()
 
     def print_notes(self, tool: str) -> None:
-        # Of a log they are what was made of its rows.
+        # The notes on a log, which say how it was read, are no warnings.
         warning = 'warning: ' if self.record.has_estimates else ''
         for note in self.notes:
             print(f'{tool}: {warning}{note}', file=sys.stderr)
 
 
 def result_directory(out: Path | None) -> Path:
-    """Create out, or results/<UTC time> where results/latest then points; raises InputError."""
+    """Create out, or results/<UTC time>, to which results/latest points; raises InputError."""
     results = out or Path('results')
     try:
         results.mkdir(parents=True, exist_ok=True)
@@ -67,13 +67,13 @@ def result_directory(out: Path | None) -> Path:
 
 
 def write_summary(summary: Mapping[str, Any], path: Path) -> None:
-    """Write strict JSON: what is not finite becomes null."""
+    """Write strict JSON: numbers that are not finite become null."""
     known = json.loads(json.dumps(summary), parse_constant=lambda _: None)
     write_atomically(path, json.dumps(known, indent=2) + '\n')
 
 
 def write_table(path: Path, header: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
-    """Write a CSV; a float in full precision, nothing for None and nan."""
+    """Write a CSV with floats in full precision, and empty cells for None and nan."""
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator='\n')
     writer.writerow(header)
@@ -82,7 +82,7 @@ def write_table(path: Path, header: Sequence[str], rows: Sequence[Sequence[objec
 
 
 def write_run(run: RunRecord, directory: Path) -> None:
-    """Write samples.csv for everyone, and record.npz with all that `report` can draw."""
+    """Write samples.csv for users, and record.npz with everything that `report` draws."""
     columns = np.column_stack([run.column(name) for name in SAMPLE_COLUMNS])
     write_table(directory / SAMPLES_FILE, SAMPLE_COLUMNS, columns.tolist())
     arrays: dict[str, Any] = {
@@ -95,13 +95,13 @@ def write_run(run: RunRecord, directory: Path) -> None:
 
 
 def rows_of(columns: Mapping[str, Array]) -> Array:
-    """Rows of a RunRecord from those of its columns, shape (N,), that are known, t among them."""
+    """Rows of a RunRecord from its known columns, shape (N,), t among them; nan in all others."""
     unknown = np.full(len(columns['t']), np.nan)
     return np.column_stack([columns.get(name, unknown) for name in COLUMNS])
 
 
 def read_record(path: Path) -> RunRecord:
-    """Read record.npz, also an older one with fewer columns; raises InputError."""
+    """Read record.npz, even an older one with fewer columns; raises InputError."""
     try:
         with np.load(path, allow_pickle=False) as stored:
             fields = {name.removeprefix('learned.'): stored[name].tolist()
@@ -115,14 +115,14 @@ def read_record(path: Path) -> RunRecord:
 
 
 def read_samples(path: Path, sample_period: float | None = None) -> RunRecord:
-    """Read samples.csv; sample_period: None takes the smallest distance. Raises InputError."""
+    """Read samples.csv. sample_period: the smallest step of t if None. Raises InputError."""
     try:
         with path.open(encoding='utf-8') as file:
             names = tuple(file.readline().strip().split(','))
             cells = np.array([[float(cell or 'nan') for cell in row] for row in csv.reader(file)])
     except (OSError, ValueError) as error:
         raise InputError(f'{path}: cannot be read: {error}') from None
-    # It once ended with f.
+    # Older files end with column f.
     if names not in (SAMPLE_COLUMNS, SAMPLE_COLUMNS[:10]):
         raise InputError(f'{path}: line 1: must be the header {",".join(SAMPLE_COLUMNS)}')
     if cells.shape[1:] != (len(names),):

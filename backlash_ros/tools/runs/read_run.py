@@ -1,4 +1,4 @@
-"""Runs from bags, joined on the number of the sample, from folders of results, from simulation."""
+"""Read runs from bags, joined on the sample number, and folders of results; simulate runs."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -26,8 +26,8 @@ from backlash_ros.tools.config import read_configuration
 from backlash_ros.tools.runs import files
 from backlash_ros.tools.runs.files import BAG, CONFIG_FILE, RECORD_FILE, SAMPLES_FILE, Run
 
-Messages = list[tuple[int, Any]]  # with their stamps [ns], in the order of these
-# Rows of an array topic: a field for each of its labels, and `stamp` [ns] since the first signals.
+Messages = list[tuple[int, Any]]  # stamps [ns] and messages, in order of the stamps
+# Rows of an array topic: a field for each label, and `stamp` [ns] since the first signals.
 Table = NDArray[np.void]
 
 NUMBER, ARRAY = 'std_msgs/msg/Float64', 'std_msgs/msg/Float64MultiArray'  # types of messages
@@ -38,12 +38,12 @@ def read_run(
 ) -> Run:
     """Read a bag, its .mcap or .db3 file, a folder of results, record.npz or samples.csv.
 
-    config: None looks for parameters.yaml beside it. axis: of several. Raises InputError.
+    config: parameters.yaml beside the run if None. axis: one of several. Raises InputError.
     """
     if not path.exists():
         raise InputError(f'{path}: does not exist')
     folder, parameters = path if path.is_dir() else path.parent, None
-    # A bag lies in the folder of the results to which the parameters belong.
+    # A bag lies in a folder of results, beside the parameters.
     beside = [folder / CONFIG_FILE, *[folder.parent / CONFIG_FILE] * is_bag(path)]
     if config := config or next(filter(Path.is_file, beside), None):
         configuration = read_configuration(config)
@@ -65,20 +65,20 @@ def read_run(
     if not len(rows):
         raise InputError('there is no sample between --from and --to')
     rows[:, COLUMNS.index('t')] -= rows[0, COLUMNS.index('t')]
-    # G is recorded as it was believed at the end.
+    # The recorded G is that of the end of the run.
     learned = record.learned if t[-1] < span.to_s else None
     return Run(replace(record, rows=rows, learned=learned), parameters)
 
 
 def find_bag(path: Path) -> Path | None:
-    """The bag at a path or in a folder of results, None where there is none."""
+    """The bag at a path or in a folder of results; None if there is none."""
     return next((place for place in (path, path / BAG) if is_bag(place)), None)
 
 
 def run_loop(loop: ClosedLoop, samples: int) -> RunRecord:
-    """Simulate a run; raises BrokenOffError when its signals grow beyond every number."""
+    """Simulate a run; raises BrokenOffError if it cannot go on, as when a signal overflows."""
     try:
-        # The controller refuses what is not finite: numpy need not say so as well.
+        # The controller refuses values that are not finite: numpy need not warn as well.
         with np.errstate(over='ignore', invalid='ignore', divide='ignore'):
             return loop.run(samples)
     except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
@@ -90,14 +90,14 @@ def run_loop(loop: ClosedLoop, samples: int) -> RunRecord:
 def read_topics(
     path: Path, wanted: Callable[[Topic], bool],
 ) -> tuple[dict[str, Messages], list[str], str]:
-    """Messages of the wanted topics of a bag by name, all topics, what is wrong with the bag."""
+    """Messages of the wanted topics of a bag by name, all topics, and the damage or ''."""
     types, found, damage = get_typestore(Stores.ROS2_JAZZY), dict[str, Messages](), ''
     try:
         reader = BagReader(path)
     except BagError as error:
         raise InputError(str(error)) from None
     for topic, stamp_ns, raw in reader.messages(wanted):
-        # Whatever damaged bytes make the library stumble over, the message is lost.
+        # Damaged bytes may make the library raise anything.
         try:
             message = types.deserialize_cdr(raw, topic.message_type)
             found.setdefault(topic.name, []).append((stamp_ns, message))
@@ -115,7 +115,7 @@ def read_topics(
 
 
 def choose_namespace(names: Sequence[str], axis: str) -> tuple[str, str]:
-    """That of an axis among topics that end alike, '' for none; a sentence about the others."""
+    """The topic of an axis among topics that end alike, or ''; and a note about the others."""
     axes = [name.strip('/').split('/')[0] for name in names]
     if axis or not names:
         return names[axes.index(axis)] if axis in axes else '', ''
@@ -124,16 +124,16 @@ def choose_namespace(names: Sequence[str], axis: str) -> tuple[str, str]:
 
 
 def topic_ends_like(name: str, topic: str) -> bool:
-    """Whether a recorded topic is this one, in whatever namespace."""
+    """Whether a recorded topic is this one, in any namespace."""
     return f'/{name}'.endswith(f'/{topic}')
 
 
 def read_bag(
     path: Path, sample_period: float | None = None, span: Span = WHOLE_SPAN, axis: str = '',
 ) -> Run:
-    """What the last controller did within the span, of a damaged bag what is left of it.
+    """Read the run of the last controller within the span, or what is left of it if damaged.
 
-    sample_period: None takes the median distance of the stamps. Raises InputError.
+    sample_period: from the median step of the stamps if None. Raises InputError.
     """
     of_driver = topics.PLANT_OUTPUT, topics.APPLIED_CONTROL
     recorded, names, damage = read_topics(path, lambda topic: topic.message_type == ARRAY or (
@@ -141,8 +141,8 @@ def read_bag(
     try:
         found, prefix, notes = _of_axis(recorded, names, axis)
         begin_ns = found[topics.SIGNALS][0][0]
-        # In lockstep the stamp is that of the newest tick that the recorder had heard: what belongs
-        # to the first signals may be stamped before them.
+        # In lockstep the stamp is the newest tick that the recorder had heard: other messages of
+        # the first sample may be stamped before its signals.
         begin = span.from_s * 1e9 if span.from_s > 0.0 else -np.inf
         found = {topic: [(stamp - begin_ns, message) for stamp, message in messages
                          if begin <= stamp - begin_ns < span.to_s * 1e9]
@@ -181,9 +181,9 @@ def read_bag(
 
 
 def _reports(recorded: Mapping[str, Messages], y: Array, axis: str) -> list[list[float]]:
-    """What applied_control reported between each output y (N,) and the one before it.
+    """The reports of applied_control between each output y (N,) and the one before it.
 
-    Empty where there is none, or the outputs are not all found by their values.
+    Empty if there are none, or if not all outputs are found by their values.
     """
     outputs, reports = (recorded.get(choose_namespace(
         sorted(name for name in recorded if topic_ends_like(name, topic)), axis,
@@ -201,13 +201,13 @@ def _reports(recorded: Mapping[str, Messages], y: Array, axis: str) -> list[list
 def _of_axis(
     recorded: dict[str, Messages], all_names: Sequence[str], axis: str,
 ) -> tuple[dict[str, Messages], str, list[str]]:
-    """The messages of one axis by topic; the prefix of its labels if it is a joint; notes."""
+    """Messages of one axis by topic, the prefix of its labels if it is a joint, and notes."""
     found: dict[str, Messages] = {}
     prefix, notes = '', list[str]()
     labels_of = {name: _labels(messages[0][1]) for name, messages in recorded.items()
                  if messages[0][1].__msgtype__ == ARRAY}
     for topic, labels in topics.LABELS_OF.items():  # signals first
-        # The nodes may have been renamed.
+        # Found by their labels, as nodes may have been renamed.
         names = sorted(name for name, given in labels_of.items()
                        if topic_ends_like(name, topic.rpartition('/')[2])
                        and {*labels} <= {label.rpartition('.')[2] for label in given})
@@ -234,10 +234,10 @@ def _labels(message: Any) -> list[str]:
 
 
 def _tabulate(topic: str, messages: Messages, prefix: str) -> Table:
-    """The messages of a topic, of several joints what is about the one with this prefix."""
+    """Rows of the messages of a topic; if it has several joints, of the one with this prefix."""
     labels = topics.LABELS_OF[topic]
     table = np.zeros(len(messages), [(label, float) for label in (*labels, 'stamp')])
-    if not messages:  # as a real plant does not know its truth
+    if not messages:  # as for the truth of a real plant
         return table
     given = _labels(messages[0][1])
     if any(len(message.data) != len(given) for _, message in messages):
@@ -246,33 +246,33 @@ def _tabulate(topic: str, messages: Messages, prefix: str) -> Table:
     for label in labels:
         table[label] = values[:, given.index(prefix + label)]
     table['stamp'] = [stamp for stamp, _ in messages]
-    # A joint that was not answered has a row of nan.
+    # A joint without a step has a row of nan.
     return table[~np.isnan([table[label] for label in labels]).all(axis=0)] if prefix else table
 
 
 def _last_section(tables: list[Table]) -> tuple[list[Table], str]:
-    """The rows of the last run, one a sample; what was left out in a sentence, or ''."""
+    """Rows of the last run, one per sample; and a note on what was left out, or ''."""
     signals, note = tables[0], ''
     restarts = np.flatnonzero(np.diff(signals['sample']) <= 0) + 1
-    # Where the count falls back that often, two nodes are at work.
+    # If the count falls back that often, two nodes are at work.
     if len(restarts) > 0.1 * len(signals):
         note = 'two controllers published at once: the first row of each sample is used'
     elif len(restarts):
         cut = signals['stamp'][restarts[-1]]
         note = ('the controller restarted its count: this is what follows the last restart, '
                 f'{cut * 1e-9:.1f} s after the beginning; --from and --to choose another part')
-        # Signals by rows, as stamps of a simulated time may be equal.
+        # Signals are cut by rows, as stamps of simulated time may be equal.
         tables = [signals[restarts[-1]:], *(each[each['stamp'] >= cut] for each in tables[1:])]
     return [each[np.unique(each['sample'], return_index=True)[1]] for each in tables], note
 
 
 def _true_columns(signals: Table, truth: Table) -> dict[str, Array]:
-    """u where it was recorded (the last v never acts), and the newest true backlash."""
+    """Columns of the truth: u, nan where not recorded, as for the last v, and the true backlash."""
     if not len(truth):
         return {}
     count, sample = signals['sample'], truth['sample']
     if not np.intersect1d(count, sample).size:
-        # A controller that was started later counts from another beginning: the same v tells.
+        # A controller that was started later counts from another number: equal v tell the offset.
         _, here, there = np.intersect1d(signals['v'], truth['v'], return_indices=True)
         if len(here):
             sample = sample + np.quantile(count[here] - sample[there], 0.5, method='lower')
@@ -284,7 +284,7 @@ def _true_columns(signals: Table, truth: Table) -> dict[str, Array]:
 
 
 def _newest_model(messages: Sequence[Any], prefix: str) -> LearnedModel | None:
-    """The last G that was told, of a joint that was answered; None where it was not complete."""
+    """The last complete G in the messages that is not all nan; None if there is none."""
     for message in reversed(messages):
         ends = np.cumsum([each.size for each in message.layout.dim])
         parts = zip(_labels(message), np.split(message.data, ends), strict=False)

@@ -1,4 +1,4 @@
-"""What is told of a run: its figures of merit, the content of summary.json, and its curves."""
+"""Summarise a run: figures of merit for summary.json, tables of estimates, curves to compare."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -22,7 +22,7 @@ ESTIMATE_HEADER = ('estimate', 'std', 'truth', 'error', 'within 1 % from')
 
 
 def summarise(run: RunRecord, parameters: Parameters | None) -> dict[str, Any]:
-    """Figures of merit of a run, the content of summary.json; raises InputError without samples."""
+    """Figures of merit of a run, as in summary.json; raises InputError if it has no samples."""
     if run.samples == 0:
         raise InputError('the run holds no sample that reached the controller')
     t, status, latency = (run.column(name) for name in ('t', 'status', 'latency_s'))
@@ -64,12 +64,12 @@ def summarise(run: RunRecord, parameters: Parameters | None) -> dict[str, Any]:
 
 
 def reference_delay(parameters: Parameters | None) -> int:
-    """Samples by which y is to follow y_m late, 0 where that is unknown."""
+    """Samples by which y is to lag y_m, 0 if unknown."""
     return build_structure(parameters).delay if parameters else 0
 
 
 def estimate_cells(summary: Mapping[str, Any], name: str) -> tuple[str, ...]:
-    """What a summary has on m, c_r or c_l, as the texts below ESTIMATE_HEADER."""
+    """Cells below ESTIMATE_HEADER for m, c_r or c_l of a summary."""
     final, std, truth, settled = (
         summary[group][name] for group in ('final', 'final_std', 'truth', 'settling_time_s'))
     known = number(final, 6), number(std, 2)
@@ -80,21 +80,21 @@ def estimate_cells(summary: Mapping[str, Any], name: str) -> tuple[str, ...]:
 
 
 def estimate_table(summary: Mapping[str, Any], title: str = '') -> str:
-    """The estimates of a run as text; title: of the first column."""
+    """The estimates of a run as a table in text. title: head of the first column."""
     return format_table((title, *ESTIMATE_HEADER),
                         [(name, *estimate_cells(summary, name)) for name in BACKLASH])
 
 
 def interesting_parts(run: RunRecord) -> tuple[slice, slice]:
-    """Rows of start and end of a run, a tenth of it each, but 2 s at least."""
+    """Rows at the start and the end of a run: a tenth of it each, but at least 2 s."""
     samples = min(max(run.samples // 10, round(2.0 / run.sample_period), 2), run.samples)
     return slice(0, samples), slice(run.samples - samples, None)
 
 
 def moving_rms(values: Array, sample_period: float) -> Array:
-    """RMS over the last ERROR_WINDOW_S at each place, fewer at the start; nan is left out."""
+    """RMS over the ERROR_WINDOW_S before each value, less at the start; nan is left out."""
     known = np.isfinite(values)
-    # Each sum from scratch: a running one would keep the rounding errors of large values long past.
+    # Not a running sum, which would keep rounding errors of large values long after them.
     window = np.ones(max(round(ERROR_WINDOW_S / sample_period), 1))
     with np.errstate(over='ignore'):  # of a law that diverges
         squares = np.convolve(np.where(known, values, 0.0) ** 2, window)[:len(values)]
@@ -103,9 +103,9 @@ def moving_rms(values: Array, sample_period: float) -> Array:
 
 
 def compare_laws(run: RunRecord, parameters: Parameters) -> tuple[dict[str, RunRecord], list[str]]:
-    """The run beside those of every other law, simulated with the same parameters (Figure 5).
+    """The run, and runs of every other law simulated with the same parameters (Figure 5).
 
-    Also what kept a law from its run.
+    The second result says which laws could not be run, and why.
     """
     t, own, notes = run.column('t'), parameters.estimator.law, []
     samples = min(round(float(t[-1]) / run.sample_period) + 1, 10_000)
