@@ -40,7 +40,7 @@ class LawReport:
     unconfirmed: bool = False  # whether samples have yet to confirm an earlier estimate
     wrong_sign: bool = False  # whether y moves against v, so that there is no estimate
     undecided: bool = False  # whether several gaps explain y alike, so that there is none
-    forbidden: OutOfBounds | None = None  # why a good estimate is not published
+    forbidden: OutOfBounds | None = None  # bound that keeps a good estimate from being published
     waiting: int = 0  # samples that no fit includes yet
     overdue: int = 0  # samples since the fit under way was due
     outliers: int = 0  # readings rejected so far

@@ -28,7 +28,7 @@ from backlash_ros.core.window import Recorder, Window
 
 
 class Proposal(NamedTuple):
-    """A G that was learned, its xi (K,) (empty: G is not to be learned), gains of its observer."""
+    """A learned G, its xi (K,) (empty if G is not to be learned), and gains of its observer."""
 
     model: StateModel
     xi: Array
@@ -93,7 +93,7 @@ class MovingHorizon(Law):
             self._belief = Belief(inherited=known, published=known)
         self._following = Following(model, observer)
         self._proposed = Proposal(model, np.zeros(0 if initial.learned else family.count))
-        self._recording = True  # whether the newest sample was to be learned from
+        self._recording = True  # whether learning was on at the newest sample
         self._lost_in_a_row = self._failed_fits = self._reattributed = 0
         self._skipping_fit = False  # whether to ignore the fit under way
 

@@ -87,7 +87,7 @@ def afresh(
     setup: Setup, record: Window, like: WindowFit | None = None, older: Prior | None = None,
     also: WindowFit | None = None, walks: bool = False,
 ) -> WindowFit | None:
-    """The best fit of a search over all gaps, with the spread of others as good; None if none fits.
+    """The best fit of a search over all gaps, with the spread of rivals; None if none explains y.
 
     like: fit whose G the search starts from. also: a further starting point. walks: try walks of u.
     """

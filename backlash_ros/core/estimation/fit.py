@@ -114,9 +114,9 @@ class Problem:
     def step(
         self, f: WindowFit, most_scale: float = inf, held: bool = False, begun: bool = False,
     ) -> WindowFit:
-        """One Gauss-Newton step: mean and covariance of the posterior of the model linearized at f.
+        """One Gauss-Newton step: posterior mean and covariance of the model linearized around f.
 
-        most_scale: limit of s. held, begun: keep the gap, or p0. Raises LinAlgError if not finite.
+        most_scale: limits s. held: keep the gap. begun: keep p0. Raises LinAlgError if not finite.
         """
         from scipy.linalg.lapack import dtrtri  # late: 31 MB that only fits need
 
@@ -200,7 +200,7 @@ class Problem:
             sensitivities(self.family, f.xi, u, y)]).T
 
     def fitted(self, f: WindowFit, steps: int = STEPS, least_gain: float = 0.0) -> WindowFit:
-        """Iterate Gauss-Newton steps from f until they converge or gain less than `least_gain`."""
+        """Take Gauss-Newton steps from f until they converge or gain under `least_gain` nats."""
         # Number of first steps in which s is at most 1: G no more wrong than configured.
         far_steps = 4 * (self.family.count > self.family.leaks)
         # A gap that moves by fewer standard deviations has converged, unless 1 nat is still gained.
@@ -212,7 +212,7 @@ class Problem:
             most = 1.0 if k < far_steps < steps else inf
             new, there, value = self._stepped(f, best, weights, most, False, False)
             if not value > best - 0.5:
-                # A kink at p0, or an undetermined gap, may block all others: hold either of them.
+                # A kink at p0, or an undetermined gap, may block progress: hold p0, or the gap.
                 for held in (False, True):
                     _, beside, of_it = self._stepped(f, best, weights, most, held, not held)
                     if of_it > value:

@@ -80,7 +80,7 @@ class Observer:
     def settle(self, noise_std: float) -> None:
         """Move one level towards the smallest gain that explains the innovations; set the noise."""
         gain, level = self._gain, self.level
-        # Chance explains 15 % of the standard deviation.
+        # An excess of up to 15 % is put down to chance.
         if self.variance > (1.15 * gain.innovation * noise_std) ** 2:
             level = min(level + 1, len(RATIOS) - 1)
         elif self.variance < gain.innovation * gain.quiet * noise_std**2:

@@ -3,7 +3,7 @@
     G(z; xi) = z^-i [B (1 - f + f z^-1) + xi_w w (1 - z^-1)^2 B'] A(1)/A_nominal(1) / (A I)
 
 xi (K,), in units of prior standard deviations: the leak of an integrator, if G integrates; a lag of
-i + f samples beside the nominal delay, i whole; the width of the response, with w = 1/8 and B' = B
+i + f samples beyond the nominal delay, i whole; the width of the response, with w = 1/8 and B' = B
 one sample shorter; ln Omega, ln D of each pair of poles, s^2 + 2 D Omega s + Omega^2; ln of a real
 pole left over. Poles at 0, on the negative axis or outside the unit circle are kept.
 """

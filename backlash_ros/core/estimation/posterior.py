@@ -24,7 +24,7 @@ SCALES = np.asarray(np.geomspace(3e-4, 10.0, 14), np.float64)  # grid of s
 
 
 class Likelihood(NamedTuple):
-    """For each reading (N,): log-density, its derivative by the output, and information on that."""
+    """For each reading (N,): log-density, score (derivative of that by the output), information."""
 
     log_density: Array
     score: Array
@@ -51,7 +51,7 @@ def likelihood(r: Array, noise_std: float, step: float, weights: Array) -> Likel
             np.full(len(r), noise_std**-2))
     half = 0.5 * step / noise_std
     probability, score, curvature = _of_interval(r / noise_std, half)
-    # Every reading gets at least the mean information, lest unknowns stay open; the sum is kept.
+    # Each gets at least the mean information, or unknowns could stay undetermined; the sum is kept.
     total = weights @ curvature + 1e-9  # positive even if no reading says anything
     information = np.maximum(curvature, total / (weights.sum() + 1e-9))
     information *= total / (weights @ information + 1e-9)
@@ -94,7 +94,7 @@ def independence(
 
 
 class Prior(NamedTuple):
-    """What older samples say: rows theta = values + white noise of standard deviation 1."""
+    """What older samples say: rows @ theta = values + white noise of standard deviation 1."""
 
     rows: Array  # (r, 3 + K)
     values: Array  # (r,)
@@ -125,9 +125,9 @@ class WindowFit:
     walk_std: float = 0.0  # of u per square root of a sample, 0: no walk
     step: float = 0.0  # quantization step if readings are taken as intervals, else 0
     scale: float = 1.0  # most probable s
-    cov: Array = field(default_factory=lambda: np.zeros((0, 0)))  # of theta, white residuals
-    volume: float = 0.0  # log volume of the posterior
-    spread: Array = field(default_factory=lambda: np.zeros((3, 3)))  # of m, c_r, c_l: other gaps
+    cov: Array = field(default_factory=lambda: np.zeros((0, 0)))  # of theta, if residuals are white
+    volume: float = 0.0  # log volume of the posterior (Occam factor)
+    spread: Array = field(default_factory=lambda: np.zeros((3, 3)))  # of m, c_r, c_l by other gaps
     left: Left = field(default_factory=Left)
 
     @property

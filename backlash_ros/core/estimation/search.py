@@ -40,7 +40,7 @@ def search(
     weights = (readings > 0.0) / np.sqrt(np.maximum(readings, 1.0))
 
     def averaged(columns: Array) -> Array:
-        """Columns (..., N) summed over bins, over the root of the number of readings in each."""
+        """Columns (..., N) summed over bins, each divided by the root of its number of readings."""
         return np.asarray(np.add.reduceat(columns * known, begins, axis=-1) * weights)
 
     common = np.vstack([state_columns(a, len(v)).T, lfilter(b, a, np.ones(len(v)))])

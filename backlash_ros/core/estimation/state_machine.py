@@ -8,8 +8,8 @@
 |           | samples                    |                      | contradict it                   |
 | DOUBTED   | newer samples contradict   | the fit before them  | KNOWN: it predicts again, or    |
 |           | the fit                    |                      | another backlash explains them; |
-|           |                            |                      | SEARCHING: neither happens for  |
-|           |                            |                      | as long as it is waited for     |
+|           |                            |                      | SEARCHING: neither happens soon |
+|           |                            |                      | enough                          |
 """
 
 from math import isnan, sqrt
@@ -124,7 +124,7 @@ def _why(setup: Setup, found: WindowFit | None, record: Window, before: Belief) 
     if found is None:
         crosses = known and np.ptp(record.v) > known.crossings[1] - known.crossings[2]
         return Status.INCONSISTENT if crosses else Status.NOT_EXCITED
-    # Until v has crossed the gap, a fit may find next to none: then use that of the first guess.
+    # Until v has crossed the gap, a fit may find next to none: use no less than the first guess.
     gap = max(found.gap, setup.guess)
     large = found.unexplained * found.gap > settings.NEGLIGIBLE * gap \
         or record.turns(gap, float(record.v[0])) >= settings.HELD_REVERSALS
@@ -164,7 +164,7 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
     rho = held.left.correlation if before.inherited is None else 0.0
     if _contradicts(problem, held, fit, new, rho):
         fit = problem.fitted(held)  # converge before blaming the samples
-    lately = trial.predicted < settings.LASTING * trial.must  # still on trial, after another
+    lately = trial.predicted < settings.LASTING * trial.must  # it replaced another one lately
     grown = lately and fit.noise > settings.AS_GOOD * trial.noise
     if grown or _contradicts(problem, held, fit, new, rho):
         beyond = np.nan_to_num((problem.residual(held)[new:] / held.noise) ** 2 - MISFIT)
@@ -197,7 +197,7 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
         after = after._replace(thorough=(record.end + 2 * count // 5, 0.5 * fit.gap_std))
     else:
         fit = problem.finished(fit)
-    if not fit.alike(held):  # no contradiction, yet another backlash: let the next samples decide
+    if not fit.alike(held):  # not contradicted, but changed: let the next samples decide
         after = after._replace(trial=Trial(PREDICTED, 0, fit.noise), reason=Status.ACQUIRING)
     after = after._replace(coasts=coasts(problem, fit))
     return _published(setup, *shortened(setup, record, problem, after, fit))
@@ -207,7 +207,7 @@ def _contradicts(
     problem: Problem, held: WindowFit, fit: WindowFit, new: int, rho: float,
 ) -> bool:
     """Whether the refit `fit` leaves more than the noise of the held fit: in samples from index
-    `new` on, or in all, if it gained those at the cost of the others. rho: their correlation."""
+    `new` on, or in all, if it fits those at the cost of others. rho: correlation of residuals."""
     weights = problem.at(fit).weights
     z = problem.residual(fit) / held.noise
     total = float(weights.sum())

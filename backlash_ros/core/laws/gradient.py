@@ -44,7 +44,7 @@ class GradientEstimator(Law):
     """Learns (m, m c_r, m c_l) from y through the filters of the four-block loop.
 
     step: gain, 0 < step < 2. noise_std: of y. While y moves against v, nothing is learned.
-    innovation: y(k) minus its prediction. u_hat: u by the estimate, on the line in use.
+    innovation: y(k) minus its prediction. u_hat: u that the estimate gives on the line in use.
     """
 
     innovation, u_hat = nan, 0.0

@@ -114,7 +114,7 @@ class InputReconstruction:
         """Process y(k), None if it was lost, and return u_hat(k - lag)."""
         self.samples += 1
         self._since_loss = 0 if y is None else self._since_loss + 1
-        # Samples after a lost one until the covariance is stationary again.
+        # The covariance is stationary again 4 lags after a lost sample.
         if y is not None and self._since_loss > 4 * self.lag:
             self._covariance = self._steady_covariance
             self._z[-1] = y / self._scale
