@@ -112,11 +112,11 @@ def _fitted(setup: explanations.Setup, v: Array, y: Array, bounds: Bounds | None
     wanted = settings.REVERSALS if family.count else 1
     values, stds = (fit.crossings * [sign, 1.0, 1.0]).tolist(), fit.crossings_std.tolist()
     doubts = {
-        f'v crossed the gap {reversals} times; {wanted} at least are needed to tell both '
+        f'v crossed the gap {reversals} times; at least {wanted} are needed to identify both '
         'crossings': reversals < wanted,
-        f'm is known to {stds[0]:.2g} only': not stds[0] <= settings.STD_SLOPE * fit.m,
+        f'm is known only to ± {stds[0]:.2g}': not stds[0] <= settings.STD_SLOPE * fit.m,
         # Even a gap of 0 counts as known if its standard deviation is below 1 % of the swing.
-        f'the gap, about {fit.gap:.4g}, is known to {fit.gap_std:.2g} only':
+        f'the gap, about {fit.gap:.4g}, is known only to ± {fit.gap_std:.2g}':
             not fit.gap_std <= max(settings.STD_GAP * fit.gap, 0.01 * swing),
     }
     outside = setup.outside_bounds(fit) if bounds else ()

@@ -188,7 +188,7 @@ class MovingHorizon(Law):
     def refine(self) -> None:
         channel, following, setup = self._channel, self._following, self._setup
         if channel.busy:
-            self._take(channel.poll())
+            self._accept(channel.poll())
         due = self._record.end >= self._belief.next_at or following.surprised
         resting = following.observer and following.since_motion > setup.family.memory
         if channel.busy or not due or not self.adapting or resting:
@@ -196,9 +196,9 @@ class MovingHorizon(Law):
         following.beyond += following.surprised  # only once per surprise
         channel.submit(fitted, self._record.since(self._belief.kept.first), setup, self._belief,
                        following.model.transfer_function, self._proposed.xi)
-        self._take(channel.poll())
+        self._accept(channel.poll())
 
-    def _take(self, result: Fitted | Failure | None) -> None:
+    def _accept(self, result: Fitted | Failure | None) -> None:
         if result is None or self._skipping_fit:
             self._skipping_fit = self._skipping_fit and result is None
             return

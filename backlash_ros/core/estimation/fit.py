@@ -57,11 +57,11 @@ class Problem:
         self.known = np.isfinite(y)
         self.y = np.where(self.known, y, 0.0)
         self.step_of_readings = posterior.step_of(y) if step is None else step
-        self._newest: dict[WindowFit, Run] = {}
+        self._runs: dict[WindowFit, Run] = {}
 
     def at(self, f: WindowFit) -> Run:
         """The record simulated with the values of this fit; the last three results are kept."""
-        if f not in self._newest:
+        if f not in self._runs:
             p = play(self.v, max(f.gap, 0.0), f.p0)
             hats, knots, _ = self._walk_of(f)
             u = f.m * p - f.theta[1] + knots @ hats
@@ -71,8 +71,8 @@ class Problem:
             weights, number = posterior.independence(self.y, self.known, y, self.step_of_readings)
             likelihood = posterior.likelihood(error, f.noise_std, f.step, weights)
             run = Run(b, a, p, u, y, error, likelihood, weights, number)
-            self._newest = dict([*self._newest.items(), (f, run)][-3:])
-        return self._newest[f]
+            self._runs = dict([*self._runs.items(), (f, run)][-3:])
+        return self._runs[f]
 
     def residual(self, f: WindowFit) -> Array:
         """Readings minus the simulated output (N,), nan where y was lost."""
@@ -268,7 +268,7 @@ class Problem:
         squares = (run.weights * run.error) @ run.error + self.nominal**2
         out = replace(f, noise_std=sqrt(squares / (free + 1.0)))
         likelihood = posterior.likelihood(run.error, out.noise_std, 0.0, run.weights)
-        self._newest[out] = run._replace(likelihood=likelihood)
+        self._runs[out] = run._replace(likelihood=likelihood)
         return out
 
     def finished(self, f: WindowFit) -> WindowFit:

@@ -47,14 +47,14 @@ class Observer:
         # A new G should not leave larger innovations than the one before.
         highest = len(RATIOS) if before is None else before.level
         self._model, self._gains = model, gains
-        self._use(min(len(RATIOS) // 2, highest), noise_std)
+        self._set_level(min(len(RATIOS) // 2, highest), noise_std)
         self.variance = (self._gain.innovation * noise_std) ** 2
         self._x = [0.0] * model.order
         self._to_state = tuple(map(tuple, model.to_state.tolist()))
         # Advances the state by one period with this u; returns the predicted y.
         self.predict = partial(model.transfer_function.advance, self._x)
 
-    def _use(self, level: int, noise_std: float) -> None:
+    def _set_level(self, level: int, noise_std: float) -> None:
         self.level, self.noise_std = level, noise_std
         self._gain = self._gains[level] if self._gains else gain_of(self._model, RATIOS[level])
         self.cov = self._gain.cov * noise_std**2
@@ -68,7 +68,7 @@ class Observer:
         """Set the state (in observer form); if it is `known`, continue with the smallest gain."""
         self._x[:] = x.tolist()
         if known:
-            self._use(0, self.noise_std)
+            self._set_level(0, self.noise_std)
 
     def correct(self, innovation: float) -> None:
         """Correct the state by an innovation, y minus its prediction."""
@@ -85,7 +85,7 @@ class Observer:
             level = min(level + 1, len(RATIOS) - 1)
         elif self.variance < gain.innovation * gain.quiet * noise_std**2:
             level = max(level - 1, 0)
-        self._use(level, noise_std)
+        self._set_level(level, noise_std)
 
 
 class Place(NamedTuple):

@@ -175,7 +175,7 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
             end=record.end, found=None, trial=trial._replace(must=must),
             doubt_from=record.first + new + change, next_at=record.end + FEWEST,
             reason=Status.INCONSISTENT if lately else before.reason)
-    # A look before it was due: what surprised may have begun just now.
+    # Look again soon after an early fit: what caused the surprise may have only just begun.
     soon = FEWEST if record.end < before.next_at else max(count // BLOCKS, FEWEST)
     after = before._replace(
         end=record.end, next_at=record.end + soon,

@@ -32,12 +32,12 @@ def coasts(problem: Problem, fit: WindowFit, known: Array | None = None) -> bool
         theta = np.concatenate([[m, m * c_r, c_r - c_l], fit.theta[3:]])
         p0 = float(problem.v[0]) + 0.5 * (c_r - c_l)
         there = problem.begun(replace(fit, theta=theta, p0=p0))
-        if _runs_on(problem, problem.finished(there)) > named:
+        if _coasting_score(problem, problem.finished(there)) > named:
             return True
-    return _runs_on(problem, fit) > named
+    return _coasting_score(problem, fit) > named
 
 
-def _runs_on(problem: Problem, fit: WindowFit) -> float:
+def _coasting_score(problem: Problem, fit: WindowFit) -> float:
     """kappa over its standard deviation for white residuals; 0 for a small kappa."""
     v, p = problem.v, problem.at(fit).p
     beyond, speed = [0.0], 0.0  # distance of a load that coasts freely from p
@@ -63,7 +63,7 @@ def with_walk(problem: Problem, f: WindowFit, least: float) -> WindowFit:
     best = f if f.walk_std == least else problem.with_intervals(problem.fitted(begin))
     if not best.valid or not best.systematic:
         return best
-    runs_on = _runs_on(problem, best) > settings.BY_CHANCE
+    seems_to_coast = _coasting_score(problem, best) > settings.BY_CHANCE
     for share in (0.005, 0.02, 0.08):  # walk over the record, in units of m times the gap
         walk_std = share * f.m * f.gap / sqrt(len(problem.v))
         if walk_std > least:
@@ -72,7 +72,7 @@ def with_walk(problem: Problem, f: WindowFit, least: float) -> WindowFit:
             needed = 0.0 if best.walk_std > least else settings.FAR_BEHIND
             # Fewer independent residuals: those of a first-order process; if a load coasts, one.
             rho = min(g.left.correlation, 0.999)
-            fewer = g.inflation if runs_on else (1.0 + rho) / (1.0 - rho)
+            fewer = g.inflation if seems_to_coast else (1.0 + rho) / (1.0 - rho)
             if g.valid and g.evidence - best.evidence > needed * fewer:
                 best = g
     return best
