@@ -198,7 +198,7 @@ def _with_gap(
 ) -> tuple[float, WindowFit]:
     """The highest log-posterior with this gap, and its fit, starting from a fit near it.
 
-    Other p0 are tried too, unless it is `close` to that of a `normal` posterior, with many turns.
+    Other p0 are tried too, unless that is within `close` of `normal` after many reversals.
     """
     v, best, theta = float(p.v[0]), (-inf, near), near.theta.copy()
     theta[2] = gap

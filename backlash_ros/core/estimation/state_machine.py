@@ -226,7 +226,7 @@ def _outliers(z: Array) -> NDArray[np.bool_]:
 
 
 def _most(least: float, count: float, rho: float) -> float:
-    """Limit on the mean square of `count` scaled residuals: what chance explains, or `least`."""
+    """Limit on the mean square of count normalized residuals: `least`, or what chance explains."""
     from scipy.special import chdtri  # late: 31 MB that only fits need
 
     free = max(count / (1.0 + (count - 1.0) * rho), 1.0)
@@ -262,8 +262,8 @@ def _doubted(setup: Setup, record: Window, before: Belief) -> Belief:
         if found is None or found.left.rms > explained \
                 or not setup.is_known(found, found.left.turns + (setup.family.count > 0)):
             continue
-        apart = held.evidence + found.evidence - 0.5 * (4 + len(held.x)) * np.log(len(part.v))
-        if whole is not None and whole.evidence > apart:
+        of_two = held.evidence + found.evidence - 0.5 * (4 + len(held.x)) * np.log(len(part.v))
+        if whole is not None and whole.evidence > of_two:
             break
         if before.found is None or not before.found.alike(found):
             return after._replace(found=found)
