@@ -30,17 +30,17 @@ class PlantModel(NamedTuple):
         (1.0, -2.88504, 2.77196, -0.88692), 'denominator of G(z), descending powers of z')
     uncertainty: float = option(0.2, 'relative spread of the time constants, damping and delay of '
                                 'G; 0: G is exact', low=0.0, high=1.0)
-    adapt: bool = option(True, 'redesign gains and preview for the G that was learned')
+    adapt: bool = option(True, 'redesign gains and preview for the learned G')
 
 
 class ActuatorModel(NamedTuple):
     numerator: tuple[float, ...] = of_both(
         (), 'numerator of L(z), from control to the motor encoder that applied_control reports; '
-        'empty: the command is what acts on the gap')
+        'empty: the command itself acts on the gap')
     denominator: tuple[float, ...] = of_both((), 'denominator of L(z), descending powers of z')
     wind_up: tuple[float, float] = of_both(
-        (0.0, 0.0), 'how much further than the motor the command has to go against the friction '
-        'of the load, on its right and on its left side', 'v')
+        (0.0, 0.0), 'how much further the command has to go than the motor, against the friction '
+        'of the load, on the right and on the left side', 'v')
 
 
 class InitialEstimate(NamedTuple):
@@ -81,19 +81,19 @@ class EstimatorOptions(NamedTuple):
     initial: InitialEstimate = InitialEstimate()
     bounds: Bounds = Bounds()
     output_noise_std: float = option(
-        1e-05, 'standard deviation of the noise on y; where it is not given, that of the simulated '
-        'noise and quantum if there is any; not live for every law', 'y', low=0.0, change='live')
+        1e-05, 'standard deviation of the noise on y; if it is not given, at least that of the '
+        'simulated noise and quantum; not live for every law', 'y', low=0.0, change='live')
     input_noise_std: float = option(
         0.0, 'moving_horizon: random walk of a slow disturbance of u per square root of a second; '
-        '0: learned where the data demand one', 'u', low=0.0, change='live')
+        '0: learned if the data demand one', 'u', low=0.0, change='live')
     drift_std: tuple[float, float, float] = option(
         (0.0, 0.0, 0.0), 'moving_horizon: random walk of m, c_r, c_l per square root of a second',
         low=0.0, change='live')
     use_applied_control: str = option(
-        'auto', 'take v from applied_control instead of the own command; auto: as soon as the '
-        'driver reports every sample, as long as it does, and where control.delay_samples is 0',
+        'auto', 'take v from applied_control instead of the commands that were sent; auto: while '
+        'the driver reports every sample, and only if control.delay_samples is 0',
         choices=('auto', 'true', 'false'), change='never')
-    lag: int = option(20, 'lms and printed: samples by which the reconstruction of u looks back',
+    lag: int = option(20, 'lms and printed: samples by which the reconstruction of u is late',
                       'samples', low=10, high=1000)
 
 
@@ -114,14 +114,14 @@ class ProportionalGain(NamedTuple):
 
 
 class TrackingWeights(NamedTuple):
-    preview: int = option(60, 'tracking: samples of y_m looked at ahead; y follows y_m delayed by '
-                          'as many', 'samples', low=0, high=10000)
-    input_weight: float = option(0.01, 'tracking, pole_placement: weight of the square of u less '
-                                 'what holds y at the reference, in units of |G|^2 at a twentieth '
-                                 'of the sampling rate', above=0.0, change='live')
+    preview: int = option(60, 'tracking: samples by which y_m is previewed; y follows y_m delayed '
+                          'by as many', 'samples', low=0, high=10000)
+    input_weight: float = option(0.01, 'tracking, pole_placement: weight of (u - u_r)^2, where u_r '
+                                 'holds y at the reference, in units of |G|^2 at a twentieth of '
+                                 'the sampling rate', above=0.0, change='live')
     integral_weight: float = option(
-        0.0, 'tracking: weight of the squared integral of y_m - y; 0, for none, suffices where the '
-        'law learns, as effective crossings take up a constant disturbance', low=0.0, change='live')
+        0.0, 'tracking: weight of the squared integral of y_m - y; 0 (none) suffices if the law '
+        'learns, as effective crossings take up a constant disturbance', low=0.0, change='live')
 
 
 class PolePlacementFilter(NamedTuple):
@@ -133,15 +133,15 @@ class InverseOptions(NamedTuple):
     caution: float = option(1.0, 'tracking: standard deviations by which the crossings are shrunk',
                             low=0.0, high=100.0, change='live')
     direction_band: float = option(
-        0.0, 'u_d has turned only after coming back by more than this', 'u', low=0.0, change='live')
+        0.0, 'u_d counts as turned once it is back by more than this', 'u', low=0.0, change='live')
     take_up_rate: float = option(
-        inf, 'largest speed of v while it crosses the gap; in proportional also while it goes '
-        'over to a line that new estimates have moved', 'v/s', above=0.0, change='live')
+        inf, 'largest speed of v while it crosses the gap; proportional: also while it moves to a '
+        'line that new estimates have shifted', 'v/s', above=0.0, change='live')
 
 
 class FixedDoubt(NamedTuple):
     doubt: float = option(
-        0.0, 'fixed: how much of the motion of u the given constants may get wrong', low=0.0)
+        0.0, 'fixed: fraction of the motion of u that the given constants may get wrong', low=0.0)
 
 
 class ControlLimits(NamedTuple):
@@ -153,25 +153,25 @@ class ControlLimits(NamedTuple):
     acceleration_max: float = option(
         inf, 'largest acceleration of v, so that a stepper loses no steps; v brakes in time for '
         'its bounds and for where it is to go', 'v/s^2', above=0.0, change='live')
-    initial: float = option(inf, 'v that acts when the controller starts, where no applied_control '
-                            'tells it; .inf: not known', 'v')
+    initial: float = option(inf, 'v that acts when the controller starts, if no applied_control '
+                            'reports it; .inf: not known', 'v')
 
 
 class Timeouts(NamedTuple):
     plant_output: float = silence(
-        0.5, 'longest silence of plant_output before on_timeout is done, 0 for never')
+        0.5, 'silence of plant_output after which on_timeout takes effect, 0 for never')
     reference: float = silence(
-        1.0, 'longest silence of reference before it is reported, 0 for never')
+        1.0, 'silence of reference after which it is reported, 0 for never')
     ramp: float = silence(0.5, 'longest ramp at the end; a v that is not at zero by then is held')
 
 
 class SavedEstimates(NamedTuple):
     file: str = option(
-        '', 'file that learned estimates are saved in, empty for none', per_node=True)
+        '', 'file in which learned estimates are saved, empty for none', per_node=True)
     load: bool = option(
         False, 'begin with the estimates in estimates.file, if it exists', per_node=True)
     save_period: float = option(
-        10.0, 'time between two savings while running, 0 to save on request and at the end only',
+        10.0, 'time between two saves while running, 0 to save only on request and at the end',
         's', low=0.0, high=86400.0, change='live', per_node=True)
 
 
@@ -186,12 +186,12 @@ class DriverMessages(NamedTuple):
     command: str = of_node('joint_state', 'joint_state_topic: JointState on joint_commands, or an '
                            'array of all joints on forward_command_controller/commands',
                            choices=('joint_state', 'array'), used_by=(CONTROLLER, RECORDER))
-    together: bool = of_node(True, 'where one joint is silent for timeout.plant_output, all joints '
-                             'do on_timeout, until it is back')
-    joint: str = of_node('', 'name of the joint in JointState, empty where there is just one',
+    together: bool = of_node(True, 'if one joint is silent for timeout.plant_output, on_timeout '
+                             'applies to all joints until it is back')
+    joint: str = of_node('', 'name of the joint in JointState, empty if there is just one',
                          used_by=(CONTROLLER, REFERENCE_NODE))
     field: str = of_node(
-        'position', 'what of the joint is y in JointState',
+        'position', 'field of JointState that is y',
         choices=('position', 'velocity', 'effort'), used_by=(CONTROLLER, REFERENCE_NODE))
     best_effort: bool = of_node(False, 'listen to a driver that publishes best effort, which may '
                                 'lose messages', used_by=(CONTROLLER, REFERENCE_NODE, RECORDER))
@@ -225,11 +225,11 @@ class TruePlant(NamedTuple):
         0.0, 'simulated dead time of u, parts of a sample included', 's', low=0.0)
     walk_std: float = simulated(
         0.0, 'simulated random walk added to u, per square root of a second; like '
-        'input_disturbance it is no part of the u that plant/truth shows', 'u', low=0.0)
+        'input_disturbance it is not included in the u of plant/truth', 'u', low=0.0)
 
 
 class NodeParameters:
-    """What nodes are given beside the numbers of control."""
+    """Parameters of nodes, beside those of control."""
 
     sample_period: float = option(0.01, 'sample period T of G(z)', 's', above=0.0,
                                   used_by=(CONTROLLER, PLANT, REFERENCE_NODE), per_node=True)
@@ -237,7 +237,7 @@ class NodeParameters:
     lockstep: bool = of_node(
         False, 'run as fast as the machine allows: each sample waits for reference and control',
         used_by=(CONTROLLER, PLANT, REFERENCE_NODE, RECORDER))
-    wait_for_subscribers: int = of_node(0, 'start only when the main topic has this many listeners',
+    wait_for_subscribers: int = of_node(0, 'start only once the main topic has so many subscribers',
                                         low=0, used_by=(CONTROLLER, PLANT, REFERENCE_NODE))
     autostart: bool = of_node(True, 'configure and activate at the start, without being asked')
     on_stop: str = option(
@@ -247,7 +247,7 @@ class NodeParameters:
     on_timeout: str = option('hold', 'the same while plant_output is silent',
                              choices=('hold', 'zero', 'ramp'), change='live', per_node=True)
     on_rival: str = option(
-        'stand_down', 'what to do where another node published control before this one was '
+        'stand_down', 'what to do if another node published control before this one was '
         'activated: publish nothing until it is gone, or go on and report it',
         choices=('stand_down', 'warn'), change='live', per_node=True)
     timeout: Timeouts
@@ -265,7 +265,7 @@ class ControllerParameters:
     estimates: SavedEstimates
     lms: LmsSteps
     gradient: GradientStep
-    structure: str = option('proportional', 'linear part that makes u_d',
+    structure: str = option('proportional', 'control structure that computes u_d',
                             choices=('proportional', 'tracking', 'pole_placement'))
     proportional: ProportionalGain
     tracking: TrackingWeights
@@ -283,7 +283,7 @@ class SimulatedPlantParameters:
     output_quantum: float = simulated(
         0.0, 'simulated resolution of y, 0 for none', 'y', low=0.0, change='live')
     output_loss: float = simulated(
-        0.0, 'simulated share of y that never arrives', low=0.0, high=0.99, change='live')
+        0.0, 'simulated fraction of y that never arrives', low=0.0, high=0.99, change='live')
     input_disturbance: float = simulated(0.0, 'simulated constant added to u', 'u', change='live')
     truth: TruePlant
     seed: int = simulated(1, 'seed of the simulated noise', low=0)
@@ -319,7 +319,7 @@ class RunParameters:
                                    "empty for one loop without a namespace; 'y' and 'n' in quotes, "
                                    'as ROS 2 reads them as true and false', used_by=(BRINGUP,))
     driver: str = option('', 'command to start instead of plant, where {axis} stands for the name '
-                         'of the axis; none waits for a driver that is started elsewhere, empty is '
+                         'of the axis; none: wait for a driver that is started elsewhere; empty: '
                          'the simulated plant', used_by=(BRINGUP,))
 
 
