@@ -127,8 +127,8 @@ def timing_of(heard: Heard, sample_period_s: float) -> Sampling:
     silent = max(int((heard.end_ns - stamps[-1]) / rough) - 1, 0)
 
     def v_of(messages: Sequence[Message], reported: bool) -> Array | None:
-        told = np.array([m for m in messages if plausible(m.value)], fields)
-        v = v_of_intervals(numbers, stamps, told['stamp_ns'], told['value'], reported)
+        valid = np.array([m for m in messages if plausible(m.value)], fields)
+        v = v_of_intervals(numbers, stamps, valid['stamp_ns'], valid['value'], reported)
         return v if np.isfinite(v).any() else None
 
     return Sampling(
@@ -179,7 +179,7 @@ def judge(graph: Graph, heard: Heard, p: Parameters) -> list[Judgement]:
 
 
 def _hidden(subject: str, behind: str) -> Judgement:
-    return Judgement(subject, UNKNOWN, f'can be told once {behind} fits')
+    return Judgement(subject, UNKNOWN, f'can be judged once {behind} fits')
 
 
 def _of_graph(graph: Graph, p: Parameters) -> Iterator[Row]:
@@ -294,11 +294,11 @@ def _of_motion(timing: Sampling, p: Parameters) -> Iterator[Row]:
             for frequency, error in zip(between, fit.error_of_model(between), strict=True))
     # An unexpected delay together with a large, coloured residual means a wrong G, too.
     yield Row('G(z)', not explained or (noisy and coloured and another_delay), predicted,
-              'enter the G(z) of this plant, discretised with sample_period; see that y is '
+              'enter the G(z) of this plant, discretised with sample_period; check that y is '
               'measured behind the gap and that the driver holds v over the period', MOTION)
     yield Row('G(z)', best.scale > 2.0,
               f'{corrected}, by more than twice plant.uncertainty={p.plant.uncertainty:g}',
-              'see that it is discretised with sample_period, or raise plant.uncertainty',
+              'check that it is discretised with sample_period, or raise plant.uncertainty',
               well=corrected)
     yield Row('reaction delay', another_delay,
               f'{fit.delay + lag} samples; control.delay_samples says {expected}',

@@ -191,8 +191,8 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
 
     def _send_last(self) -> None:
         """Send the last commands; hold v after timeout.ramp, or on SIGTERM as a second signal."""
-        p, told, why = self.settings, time.monotonic(), ''
-        step_s, deadline = max(p.sample_period, 1e-3), told + p.timeout.ramp
+        p, diagnosed_at, why = self.settings, time.monotonic(), ''
+        step_s, deadline = max(p.sample_period, 1e-3), diagnosed_at + p.timeout.ramp
         while self.loops.send_next():
             late = time.monotonic() + step_s > deadline
             if not why and (late or SIGTERM in self.signals[1:]):
@@ -203,8 +203,8 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
                             f'v={loop.v:.6g} is held: {why} came before it reached zero'
                         )
             time.sleep(step_s)
-            if time.monotonic() > told + DIAGNOSTICS_PERIOD_S:
-                told = time.monotonic()
+            if time.monotonic() > diagnosed_at + DIAGNOSTICS_PERIOD_S:
+                diagnosed_at = time.monotonic()
                 self._diagnose()  # or a controller that stands down would think it gone
         self._io.publisher.wait_for_all_acked(Duration(nanoseconds=100_000_000))
 

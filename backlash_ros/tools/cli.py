@@ -43,7 +43,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     '--sweep': {'action': 'append', 'default': [], 'metavar': 'KEY=v1,v2,...', 'help': 'run every '
                 'value of a parameter; given again, every combination'},
     '--columns': {'type': parse_columns, 'default': {}, 'metavar': 't=…,v=…,y=…', 'help': 'which '
-                  'columns of a table, or signals of a bag (default: told by their names)'},
+                  'columns of a table, or signals of a bag (default: by their names)'},
     '--axis': {'default': '', 'metavar': 'NAME', 'help': 'which one of several axes or joints'},
     '--seed': {'type': int, 'metavar': 'N', 'help': 'seed of the simulated noise'},
     '--duration': {'type': float, 'metavar': 'SECONDS', 'help': 'length of a run (default: the '

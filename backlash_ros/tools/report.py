@@ -21,7 +21,7 @@ from backlash_ros.tools.figures import png
 from backlash_ros.tools.page import Picture, table, write_page
 from backlash_ros.tools.records.reading import read_run_or_log
 from backlash_ros.tools.runs import files
-from backlash_ros.tools.runs import summary as told
+from backlash_ros.tools.runs import summary as summaries
 from backlash_ros.topics import BACKLASH
 
 REPORT_PAGE = 'report.html'
@@ -30,7 +30,7 @@ HTML_SYMBOLS = {'m': 'm', 'c_r': 'c<sub>r</sub>', 'c_l': 'c<sub>l</sub>'}
 
 def write_report(run: files.Run, out: Path) -> dict[str, Any]:
     """Write report, figures, samples.csv and summary.json of a run to out; return the summary."""
-    summary = told.summarise(run.record, run.parameters)
+    summary = summaries.summarise(run.record, run.parameters)
     lost, total = summary['lost_samples'], summary['lost_samples'] + summary['samples']
     if lost > 0.01 * total and not (run.parameters and run.parameters.output_loss):
         run = run._replace(notes=(*run.notes, (
@@ -57,10 +57,10 @@ def _figures(
         yield Picture('log.png', 'v and y', 'What the log holds. With play, y over v is a loop '
                       'with level stretches where v turns.', png(figures.draw_log(run)))
         return
-    start, end = told.interesting_parts(run)
+    start, end = summaries.interesting_parts(run)
     parts = {'Start': start, 'End': end}
     truth, error, innovation = run.has_truth, control_error(run), run.column('innovation')
-    laws, notes = told.compare_laws(run, parameters) if truth and parameters else ({}, [])
+    laws, notes = summaries.compare_laws(run, parameters) if truth and parameters else ({}, [])
     known = np.isfinite(error).any()
     duration = min(float(run.column('t')[-1]) + run.sample_period, 1e4 * run.sample_period)
     off = summary['tracking_error_rms']
@@ -90,7 +90,7 @@ def _figures(
         (True, 'output', 'Reference and output', 'y follows y<sub>m</sub>.' if followed else
          'Each on its own scale: y does not follow y<sub>m</sub>, nor does the structure '
          'u<sub>d</sub> = y<sub>m</sub> + f v aim at that.',
-         figures.draw_output, end, told.reference_delay(parameters), followed),
+         figures.draw_output, end, summaries.reference_delay(parameters), followed),
         (True, 'input', 'Desired input and control', 'v jumps by the width of the gap whenever '
          'u<sub>d</sub> turns.', figures.draw_input, parts),
     ):
@@ -112,14 +112,14 @@ def headline(summary: Mapping[str, Any]) -> str:
 
 def _tables(summary: Mapping[str, Any]) -> str:
     rows = [
-        (symbol, *told.estimate_cells(summary, name), 'of u/v' if name == 'm' else 'of v')
+        (symbol, *summaries.estimate_cells(summary, name), 'of u/v' if name == 'm' else 'of v')
         for name, symbol in HTML_SYMBOLS.items()]
     rows.append(('f', number(summary['final']['f'], 6), *[NOTHING] * 4, 'of u/v'))
     latency = summary['loop_latency_ms'] or {'p50': None, 'p99': None}
     duration = (summary['samples'] + summary['lost_samples']) * summary['sample_period']
     first = summary['began_with']
     began = ', '.join(f'{name} {number(first[name], 6)}' for name in BACKLASH)
-    return table(('', *told.ESTIMATE_HEADER, 'unit'), rows) + table((), [
+    return table(('', *summaries.ESTIMATE_HEADER, 'unit'), rows) + table((), [
         ('samples', f'{summary["samples"]} in {duration:.6g} s'),
         ('lost samples', str(summary['lost_samples'])),
         ('sample period', f'{summary["sample_period"]:.6g} s'),

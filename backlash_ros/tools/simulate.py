@@ -97,8 +97,8 @@ def _many(parameters: Parameters, options: argparse.Namespace) -> None:
             named.setdefault(f'broke off ({outcome["problem"]})', []).append(run.seed)
         elif None in [outcome[f'settling_{name}'] for name in BACKLASH]:
             named.setdefault('not within 1 % at the end', []).append(run.seed)
-    for what, of in named.items():
-        print(f'{what}: {len(of)} runs, seed {", ".join(map(str, dict.fromkeys(of)))}')
+    for what, affected in named.items():
+        print(f'{what}: {len(affected)} runs, seed {", ".join(map(str, dict.fromkeys(affected)))}')
     print(f'runs: {csv}')
 
 

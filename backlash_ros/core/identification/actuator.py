@@ -3,8 +3,8 @@
     v(k) = z L(z) command(k) - w s(k) - offset,   s = 1, -1 while the load is pushed right, left
 
 Dry friction of the load holds the motor back by w while it pushes, but not within the gap. This
-builds up after contact, so only samples some time after contact are fitted. The backlash that was
-identified behind v tells s. The model is linear in all but the poles of L.
+builds up after contact, so only samples some time after contact are fitted. s follows from the
+backlash that was identified behind v. The model is linear in all but the poles of L.
 """
 
 from collections.abc import Iterator
@@ -24,7 +24,7 @@ from backlash_ros.core.plant.transfer_function import Array, TransferFunction
 
 
 def with_actuator(found: Identification, commands: Array) -> Identification:
-    """The result with the actuator between the commands (N,) and the reported v, if there is one.
+    """Add the actuator between the commands (N,) and the reported v to a result, if there is one.
 
     If no L explains v, the result gets a remark instead.
     """
@@ -47,8 +47,8 @@ def with_actuator(found: Identification, commands: Array) -> Identification:
         return replace(found, actuator=actuator)
     return found.with_remarks(
         *found.remarks,
-        f'applied_control is off control by {left / gap:.0%} of the gap (rms) that no lag '
-        'explains, and y will follow worse for it: stay within what the motor can follow')
+        f'applied_control differs from control by {left / gap:.0%} of the gap (rms), which no lag '
+        'explains, and y will follow less well: stay within what the motor can follow')
 
 
 def _fits(

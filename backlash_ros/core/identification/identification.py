@@ -176,7 +176,7 @@ def _why_nothing(v: Array, y: Array, options: Options) -> str:
     if np.ptp(v) == 0.0:
         return 'v stood still: move it to and fro, past the gap'
     if np.nanmax(y) == np.nanmin(y):
-        return 'y stood still: let v swing wider than the gap, and see that y is measured'
+        return 'y stood still: let v swing wider than the gap, and check that y is measured'
     return ''
 
 

@@ -115,7 +115,7 @@ class Samples:
 
 @dataclass(eq=False)
 class Model:
-    """A structure and its fit, in scaled units; of two models the one with less squares is less.
+    """A structure and its fit, in scaled units. Models compare by their sums of squares.
 
     numerator: B. denominator: A with the integrator; a: its free coefficients after the leading 1.
     run: simulated y, and the play output that acts on it, at every sample. left: the residual where
@@ -269,7 +269,7 @@ def least_response(best: Model, rivals: Sequence[Model] = ()) -> Model:
 
 
 def _smoothed(found: Model, silent: Array, noise_variance: float) -> Model:
-    """With the heaviest penalty on |G| at `silent` that stays within two standard deviations."""
+    """The model with the heaviest penalty on |G| at `silent` within two standard deviations."""
     covariance, taps = covariance_of(found.problem, found.fit), found.structure.numerator_taps
     # Times B they are G at these frequencies but for its phase, real and imaginary parts.
     back = np.exp(-1j * silent)

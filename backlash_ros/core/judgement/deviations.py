@@ -68,7 +68,7 @@ def effective(residual: Array) -> float:
 
 
 def lag_one(residual: Array, certain: bool = False) -> float:
-    """Lag-1 correlation of residuals (R,) without nan, at least 0; certain: less what is chance."""
+    """Lag-1 correlation of residuals (R,) without nan, at least 0; certain: beyond 3/sqrt(R)."""
     residual = residual[np.isfinite(residual)]
     energy = float(residual @ residual)
     if energy == 0.0 or not np.isfinite(energy):

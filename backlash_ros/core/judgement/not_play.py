@@ -125,7 +125,7 @@ class LinearFamily:
         return (one.squares - other.squares) / beyond if gain >= 15.0 else 0.0
 
     def beats(self, other: Candidate, one: Candidate, noise: float) -> bool:
-        """Whether `other` explains nearly all of it, and half of it in each half of the record."""
+        """Whether `other` explains nearly all of that, and much in each half of the record."""
         explained, half = 0.95, len(self.rows) // 2
         return self.share(other, one, noise) >= explained and all(
             self.solved(other.columns, part)[0]
@@ -174,7 +174,7 @@ class Observed:
         return min(self.family.share(other, one, self.noise), 1.0)
 
     def best(self, nonlinearity: Callable[..., Array], starts: Sequence[At]) -> Candidate:
-        """Fit a nonlinearity from these starts; a second call returns the first result."""
+        """Fit a nonlinearity from these starts, once: later calls return the first result."""
         if nonlinearity not in self._candidates:
             self._candidates[nonlinearity] = self.family.best(nonlinearity, starts)
         return self._candidates[nonlinearity]
@@ -184,7 +184,7 @@ class Observed:
 
 
 def centred(v: Array, width: float) -> Array:
-    """Output of a play whose gap is centred on it."""
+    """Output of a play, less half its gap so that it is centred on v."""
     width = abs(width)
     return play(v, width, float(v[0]) + 0.5 * width) - 0.5 * width
 

@@ -79,7 +79,7 @@ class Findings(NamedTuple):
 
     @property
     def swing(self) -> float:
-        """Range of v."""
+        """Peak-to-peak range of v."""
         return float(np.ptp(self.observed.v))
 
     @property
@@ -183,7 +183,7 @@ def _changes(f: Findings) -> Iterator[Doubt]:
 
 
 def _backlash(f: Findings, most: Doubt, spread: float, coasts: bool) -> Answer:
-    """Whether the gap is known, or known to be absent. coasts: the load does, by PRECISE gaps."""
+    """Whether the gap is known, or known to be absent. coasts: whether coasting changes it much."""
     roughly = 0.25  # relative standard deviation up to which the gap is known
     o, way = f.observed, np.sign(np.diff(f.observed.p))
     turns = int(np.count_nonzero(np.diff(way[way != 0.0])))
@@ -197,7 +197,7 @@ def _backlash(f: Findings, most: Doubt, spread: float, coasts: bool) -> Answer:
     may_be = f'a gap of up to {bound:.2g} cannot be ruled out'
     for holds, reason, cure in (
         (f.evidence < 15.0, f'y shows nothing of v, which swung by {f.swing:.4g}',
-         'let v swing wider than the gap, and see that v is what the actuator gets'),
+         'let v swing wider than the gap, and check that v is what the actuator gets'),
         (f.gap >= 0.95 * f.swing, f'the gap is at its bound, the swing of v ({f.swing:.4g})',
          'let v swing wider, past the gap in both directions'),
         # Fewer turns leave gap, crossings and start entangled.

@@ -225,7 +225,7 @@ def _numbering(t: Array, steps: Array, period: float, late: bool) -> Numbering:
     """Of several ways to number the rows, the one closest to a line. steps (M - 1,): in periods."""
     found = [_along(_late_numbers(t / period), t)]
     if not late:
-        # Over a long record, the error of a median of uneven steps would add up: the mean as well.
+        # Over a long record the error of a median of uneven steps adds up, so try the mean as well.
         usual = steps[steps < 0.5 * BREAK]
         mean = period * (float(np.mean(usual)) if usual.any() else 1.0)
         found += [_along(numbers, t) for numbers in (

@@ -21,7 +21,7 @@ WAITS_NS = 2**63 - 1  # instead of that time: waits for the lock, behind all oth
 
 
 class CommandLock:
-    """Lets only one process of a machine command a topic, before discovery knows of the others.
+    """Lets only one process of a machine command a topic, even before they discover each other.
 
     The lock is a name in the abstract namespace of Unix sockets (Linux), made of domain and topic.
     The kernel releases it when its process ends, however that ends.

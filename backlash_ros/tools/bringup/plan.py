@@ -210,11 +210,11 @@ def plan_processes(
                 stage.append(_node(axis, node, record))
         if p.driver and p.driver != ELSEWHERE:
             served.setdefault(p.driver, []).append(axis)
-    for command, of in served.items():
-        name = of[0].process_name('driver') if len(of) == 1 else \
-            f'driver of {", ".join(axis.name for axis in of)}'
+    for command, sharing in served.items():
+        name = sharing[0].process_name('driver') if len(sharing) == 1 else \
+            f'driver of {", ".join(axis.name for axis in sharing)}'
         stages[1].append(Child(
-            name, shlex.split(command), of[0].logs / 'driver.log', foreign=True))
+            name, shlex.split(command), sharing[0].logs / 'driver.log', foreign=True))
     if live_port is not None:
         shown = [f'/{axis.name}' if axis.name else '/controller' for axis in axes]
         stages[-1].append(Child(

@@ -240,5 +240,5 @@ if __name__ == '__main__':  # the guardian
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     # The last line says what to stop; it is complete once the supervisor has gone.
-    if told := sys.stdin.read().splitlines():
-        stop_stages(*json.loads(told[-1]))
+    if lines := sys.stdin.read().splitlines():
+        stop_stages(*json.loads(lines[-1]))

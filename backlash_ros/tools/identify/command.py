@@ -82,8 +82,8 @@ def _identify(args: Sequence[str] | None) -> int:
         from backlash_ros.tools.config import read_configuration
         configuration = read_configuration(options.config)
         given = configuration.given(options.axis if configuration.axes else '')
-    told = options.period or given.get('sample_period')
-    period = told if isinstance(told, float) else None
+    given_period = options.period or given.get('sample_period')
+    period = given_period if isinstance(given_period, float) else None
     if options.drive:
         from backlash_ros.tools.identify.drive import drive
         if options.axis:

@@ -65,16 +65,16 @@ def write_outcome(
     notes = [*record.notes, *found.remarks]
     constants = [(name, f'{getattr(found, name):.6g}', f'{found.std[name]:.2g}')
                  for name in ('gap', 'c_r', 'c_l', 'm') if found.std]
-    head, told = ('', 'found', '±'), _facts(found, record)
+    head, facts = ('', 'found', '±'), _facts(found, record)
     write_page(
         out / 'identify.html', 'Identification of backlash and G(z)',
         f'<b>The backlash is {"" if known else "not "}known</b>: {len(found.y)} samples of '
         f'{found.sample_period:g} s from {escape(record.source)}.', [*lines, *refused, *notes],
-        [table(head, constants) + table((), [(name, escape(fact)) for name, fact in told])]
+        [table(head, constants) + table((), [(name, escape(fact)) for name, fact in facts])]
         if constants else [], list(_pictures(found)), None if text is None else (YAML, text))
     print('\n'.join([
         *lines, *([format_table(head, constants)] if constants else []),
-        *(f'{name}: {fact}' for name, fact in told), *(f'note: {note}' for note in notes), *refused,
+        *map(': '.join, facts), *(f'note: {note}' for note in notes), *refused,
         str(out / (YAML if found.usable else 'identified.json')), str(out / 'identify.html')]))
     return known
 
@@ -117,11 +117,11 @@ def write_record(record: Record, path: Path) -> None:
 def _facts(found: Identification, record: Record) -> list[tuple[str, str]]:
     """What was found besides the backlash, as (name, text), for the terminal and the page."""
     g = found.model
-    told = [('time', record.timing), ('lost samples, outliers', f'{record.lost}, {g.outliers}')]
+    facts = [('time', record.timing), ('lost samples, outliers', f'{record.lost}, {g.outliers}')]
     if found.details is not None:
         band, held_out = found.hertz, found.details.held_out
         alike = f' ({g.delays[0]} to {g.delays[-1]} fit alike)' if len(g.delays) > 1 else ''
-        told += [
+        facts += [
             ('G(z)', f'{len(g.denominator) - 1} poles{", one of them an integrator" * g.integrator}'
                      f', delay {g.delay}{alike}, known to {100.0 * g.response_std.max():.2g} % '
                      f'from {band[0]:.2g} to {band[-1]:.2g} Hz'),
@@ -131,10 +131,10 @@ def _facts(found: Identification, record: Record) -> list[tuple[str, str]]:
             ('error on samples held out', f'{held_out.rms:.3g} (fit: {held_out.trained:.3g})')]
     if (actuator := found.actuator) is not None:
         right, left = actuator.wind_up
-        told.append(('L(z), from control to applied_control',
+        facts.append(('L(z), from control to applied_control',
                      f'{actuator.lag.order} poles, gain {actuator.gain:.6g}; wind-up {right:.4g} '
                      f'on the right, {left:.4g} on the left'))
-    return told
+    return facts
 
 
 def identified_parameters(

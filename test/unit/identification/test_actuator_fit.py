@@ -65,7 +65,7 @@ def test_a_motor_that_no_lag_describes_is_told_of_and_left_out() -> None:
     bent = np.where(commands > 0.0, 2.0 * commands, commands)
     found_so = with_actuator(found(), bent)
     assert found_so.actuator is None
-    assert 'applied_control is off control by' in found_so.remarks[-1]
+    assert 'applied_control differs from control by' in found_so.remarks[-1]
     assert len(motor) == len(bent)
 
 
