@@ -151,7 +151,7 @@ MISTAKES = {
     'rate 6 % slow': Mistake('Hz, sample_period is 0.005 s (200 Hz)', 'slow'),
     'second controller': Mistake(
         '/second', made=lambda on, driver: on.start('controller', '-r', '__node:=second')),
-    'NaN sensor': Mistake('is no finite number: check the sensor', 'nan',
+    'NaN sensor': Mistake('is not a finite number: check the sensor', 'nan',
                           lambda on, driver: driver.process.send_signal(signal.SIGUSR1)),
     'wrong type': Mistake('is sent as Float32, Float64 is wanted', 'type'),
     'best effort': Mistake('is sent best effort, which does not arrive', 'best_effort'),

@@ -26,7 +26,7 @@ def drive_limits(p: Parameters, amplitude: float | None, rate: float | None) -> 
     ):
         if abs(value) == inf:
             raise ParameterError(
-                name, value, 'is no limit to drive within', f'set {name}, or give {option}')
+                name, value, 'must be finite to drive v', f'set {name}, or give {option}')
     if not low < high:
         raise ParameterError('control.min', low, f'must be < control.max={high!r} within '
                              f'--amplitude={excursion:g}')

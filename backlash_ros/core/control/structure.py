@@ -138,7 +138,7 @@ def _on_the_line(y_m: float, e: Estimate, side: Region) -> float:
 class PolePlacement(ControlStructure):
     """Computes u_d by the four blocks (numerics.py) for the nominal G, and v = BI(u_d).
 
-    delay: by which B/A_m delays a slow reference, rounded to samples.
+    delay: samples by which B/A_m delays a slow reference, rounded.
     """
 
     def __init__(self, blocks: FourBlocks) -> None:

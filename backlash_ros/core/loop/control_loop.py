@@ -201,7 +201,7 @@ class ControlLoop:
         p, driver = self._p, self.driver
         if missing := p.missing_limits:
             driver.warn(f'{", ".join(missing)}: not set, so nothing keeps v within what the '
-                        'actuator bears: set them')
+                        'actuator can bear: set them')
         reported = self.commands.newest_report(output.stamp_ns)
         if isfinite(reported):
             self._go_on_from(self.core.command_of(reported))
@@ -235,8 +235,8 @@ class ControlLoop:
         reports = commands.reported_over(lost + 1, stamp_ns, unsent)
         origin, told = commands.origin, acted[-1] / core.command_of(1.0)
         if reports and origin.changed_by(reports[-1] + origin.value, told, self.estimate):
-            self.driver.warn(f'{self.driver.applied} is {origin.value:.4g} beyond v: taken for '
-                             'another zero of the motor encoder, and subtracted')
+            self.driver.warn(f'{self.driver.applied} is {origin.value:.4g} above v: taken as '
+                             'the zero offset of the motor encoder, and subtracted')
             self.renew(origin.before)
             return self._step_core(y, y_m, stamp_ns)
         return core.step(y, y_m, lost, reports, others, acted)

@@ -76,7 +76,7 @@ class LevelLog:
         if finding.level == Level.OK:
             if self._told is not None and lasted:
                 self._told = None
-                self._write(Level.OK, f'well again: {finding.text}')
+                self._write(Level.OK, f'recovered: {finding.text}')
         elif (lasted or not finding.lasting) and key != self._told \
                 and now_s >= self._told_at.get(key, -inf) + AGAIN_S:
             self._told, self._told_at[key] = key, now_s
@@ -266,9 +266,9 @@ def causes_of(f: LoopFigures) -> tuple[Row, ...]:
         *_unheard(f.around),
         # Useless messages.
         ('bad outputs', warn if f.used else error, f.bad_outputs > TROUBLE * heard,
-         f'{_percent(f.bad_outputs, heard)} of {y} is no finite number: check the sensor'),
+         f'{_percent(f.bad_outputs, heard)} of {y} is not a finite number: check the sensor'),
         ('bad references', warn, f.bad_references > 0, f'{f.bad_references} {y_m} messages '
-         'lately were no finite number: the last good one holds'),
+         'lately were not finite: the last good one holds'),
         ('wraps', warn, f.wraps > 0,
          f'{y} jumps by 2 pi: it is an angle that wraps: let the driver count the turns'),
         # Other nodes.
@@ -297,7 +297,7 @@ def causes_of(f: LoopFigures) -> tuple[Row, ...]:
          f'{y} repeats its stamps, so the time of sending counts: stamp each message anew'),
         ('clock', warn, abs(age_s) > SKEW * period_s,
          f'{y} comes {1e3 * abs(age_s):.3g} ms {"before" if age_s < 0.0 else "after"} its stamp: '
-         'set both clocks (chrony, PTP)' + (' or shorten the way' if age_s > 0.0 else '')),
+         'set both clocks (chrony, PTP)' + (' or shorten the path' if age_s > 0.0 else '')),
         ('late', warn, f.late > TROUBLE * f.used, f'{_percent(f.late, f.used)} of {v} came too '
          'late: relieve the machine or lengthen sample_period'),
         ('unsent', warn, f.unsent > TROUBLE * due and not isfinite(rate),
@@ -344,18 +344,18 @@ def state_beside(causes: set[str], f: LoopFigures) -> Finding:
         ('given', ok, given and status == Status.TRACKING,
          'estimates as given: estimator.law fixed learns nothing'),
         ('adaptation off', ok, not adapting and status != Status.INCONSISTENT,
-         'estimates held as ~/freeze_adaptation asked; v is still answered'),
+         'estimates held by ~/freeze_adaptation; outputs are still answered'),
         ('known', ok, law.unconfirmed and status == Status.ACQUIRING,
-         'estimates of before hold: only a v at several speeds could confirm them'),
+         'earlier estimates hold: only a v at several speeds can confirm them'),
         ('bound', warn, law.forbidden is not None and status == Status.ACQUIRING,
          f'{name} is {value:.4g}, beyond estimator.bounds.{name} [{low:g}, {high:g}]: widen it'
          + (', or correct the zero of y' if name != 'm' else '')),
         ('undecided', ok, law.undecided and status == Status.ACQUIRING,
-         'learning: several gaps explain y alike: let v move between more than two values'),
+         'learning: several gaps explain y equally well: move v between more than two values'),
         ('acquiring', ok, status == Status.ACQUIRING, 'learning: the estimates still move freely'),
         ('learned', ok, status == Status.TRACKING, 'learned: the estimates agree with the data'),
         ('not excited', warn, status == Status.NOT_EXCITED,
-         'estimates held: v did not swing past the gap lately; move it wider'),
+         'estimates held: v has not swung past the gap lately; move it further'),
         ('no data', warn, status == Status.NO_DATA, f'estimates held: {y} is missing'),
         ('model', error, law.wrong_sign,
          f'{y} moves against v: reverse it, or the sign of plant.numerator'),

@@ -125,7 +125,7 @@ def check_value(parameter: Parameter, value: object) -> Value:
         if words and value not in words:
             raise refused(value, f'must be one of {", ".join(words)}')
         if not isinstance(value, str):
-            raise refused(value, 'must be a text')
+            raise refused(value, 'must be a string')
         return value == 'true' if isinstance(default, bool) else parameter.choices.get(value, value)
     number = _number(parameter, value)
     if isinstance(default, float):

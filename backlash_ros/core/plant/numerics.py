@@ -124,7 +124,7 @@ def lyapunov(a: Array, q: Array) -> Array:
 
 
 class Gain(NamedTuple):
-    """Gain and deviations of the stationary Kalman filter, in units of the noise on y."""
+    """Gain and standard deviations of the stationary Kalman filter, in units of the noise on y."""
 
     gain: tuple[float, ...]  # of the update after a prediction, in observer form
     innovation: float  # standard deviation of the innovation

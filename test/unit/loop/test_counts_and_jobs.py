@@ -60,7 +60,7 @@ def lines_of(findings: list[tuple[float, Finding]]) -> list[tuple[Level, str]]:
 def test_a_change_of_level_is_one_line_and_one_when_all_is_well_again() -> None:
     findings = [(float(t), WRONG if 5 <= t < 20 else WELL) for t in range(40)]
     assert lines_of(findings) == [
-        (Level.ERROR, 'the model is wrong'), (Level.OK, 'well again: learned')]
+        (Level.ERROR, 'the model is wrong'), (Level.OK, 'recovered: learned')]
 
 
 def test_what_comes_and_goes_is_told_once_per_while() -> None:
@@ -69,7 +69,7 @@ def test_what_comes_and_goes_is_told_once_per_while() -> None:
     slowly = [(0.1 * n, WRONG if n // 30 % 2 else WELL) for n in range(600)]
     told = lines_of(slowly)
     assert len(told) <= 2 * (60.0 / AGAIN_S + 1)
-    assert {text for _, text in told} == {'the model is wrong', 'well again: learned'}
+    assert {text for _, text in told} == {'the model is wrong', 'recovered: learned'}
 
 
 def test_what_passes_by_itself_is_told_once_it_has_lasted() -> None:

@@ -61,7 +61,7 @@ CASES: list[tuple[dict[str, Any], Level, str]] = [
      'plant_output comes at 50 Hz, sample_period is 0.005 s (200 Hz): correct one of them'),
     ({'intervals_s': (0.0001, 0.0025, 0.0026)}, Level.WARN, 'plant_output comes at 400 Hz'),
     ({'age_s': 0.05}, Level.WARN,
-     'plant_output comes 50 ms after its stamp: set both clocks (chrony, PTP) or shorten the way'),
+     'plant_output comes 50 ms after its stamp: set both clocks (chrony, PTP) or shorten the path'),
     ({'age_s': -0.003}, Level.WARN,
      'plant_output comes 3 ms before its stamp: set both clocks (chrony, PTP)'),
     ({'late': 60}, Level.WARN, '10 % of control came too late: relieve the machine'),
@@ -89,10 +89,10 @@ CASES: list[tuple[dict[str, Any], Level, str]] = [
     ({'control': TopicFigures('control', peers=(Peer('/driver', 'Float64', 'qos'),))},
      Level.ERROR, 'control does not reach /driver: its QoS does not fit'),
     ({'bad_outputs': 600, 'used': 0}, Level.ERROR,
-     '100 % of plant_output is no finite number: check the sensor'),
-    ({'bad_outputs': 60}, Level.WARN, '9.09 % of plant_output is no finite number'),
+     '100 % of plant_output is not a finite number: check the sensor'),
+    ({'bad_outputs': 60}, Level.WARN, '9.09 % of plant_output is not a finite number'),
     ({'bad_references': 3, 'reference_silent_s': inf, 'status': None, 'used': 0,
-      'without_reference': 600}, Level.WARN, '3 reference messages lately were no finite number'),
+      'without_reference': 600}, Level.WARN, '3 reference messages lately were not finite'),
     ({'silent_s': 0.5}, Level.WARN, 'no plant_output for 0.5 s: is the driver running? '
      'on_timeout: hold'),
     ({'status': None, 'used': 0, 'output': output_from()}, Level.WARN,
@@ -250,7 +250,7 @@ def test_losses_jitter_and_a_sensor_at_rest_with_v_inside_the_gap_are_no_fault(c
 
 
 @pytest.mark.parametrize(('changes', 'text', 'trouble', 'level'), [
-    ({'adapting': False}, 'estimates held as ~/freeze_adaptation asked',
+    ({'adapting': False}, 'estimates held by ~/freeze_adaptation',
      {'status': Status.INCONSISTENT}, Level.ERROR),
     ({'given': True}, 'estimates as given', {'late': 60}, Level.WARN),
 ])

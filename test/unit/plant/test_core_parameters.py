@@ -152,7 +152,7 @@ def test_word_outside_the_choices_is_refused_and_they_are_listed(parameter: Para
 
 @named([p for p in BY_NAME.values() if isinstance(p.default, str)])
 def test_word_must_be_a_text(parameter: Parameter) -> None:
-    said = 'must be one of ' if parameter.choices else 'must be a text'
+    said = 'must be one of ' if parameter.choices else 'must be a string'
     assert said in refusal_of(parameter.name, 1.0)
 
 

@@ -25,7 +25,7 @@ from backlash_ros.core.plant.backlash import GAP, LEFT, RIGHT, Region
 from backlash_ros.core.plant.transfer_function import Array
 
 TRUSTED_AFTER = 40  # samples for which an estimate has to hold before it gets full feedback
-# A sample with relative deviations of slope and gap below SHARP counts SHARP_COUNTS times.
+# A sample with relative standard deviations of slope and gap below SHARP counts as so many.
 SHARP, SHARP_COUNTS = 0.01, 17
 # v is held while |x - x*|, the root of the energy of the free response of y over some 50 samples,
 # is below so many standard deviations of the noise on y; a constant error y of one of them gives 7.
@@ -115,7 +115,7 @@ class StateFeedback:
         another, self._newest = estimate is not self._newest, estimate
         if another:
             # While it is acquiring, as after a restart, a learned estimate is not yet confirmed. A
-            # law without deviations has learned once it was tracking, whatever comes after.
+            # law without standard deviations has learned once it was tracking, and keeps that.
             trust.known = status not in (Status.ACQUIRING, Status.INCONSISTENT) and (
                 trust.known or estimate.learned or status is Status.TRACKING)
             trust.crossings = shrunk_crossings(estimate, self.shrinkage, trust.known)
@@ -183,8 +183,8 @@ class StateFeedback:
                 state.free += 1
                 if state.level > 0 and state.free % stiffen_after == 0:
                     state.level -= 1
-            # K, or a softer gain while v does not follow or the estimate is new. Further away than
-            # x* ever was, and than noise explains, what the gain makes of noise does not matter.
+            # K, or a softer gain while v does not follow or the estimate is new. If x is further
+            # off than x* ever was and than noise explains, the noise in u does not matter.
             astray = off > max(largest, ASTRAY / ARRIVED * noise.ignored)
             unproven = SOFTEST - trust.held_for * (SOFTEST + 1) // TRUSTED_AFTER
             self._in_use = max(state.level, unproven, 0 if astray else self._quiet)

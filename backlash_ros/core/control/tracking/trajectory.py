@@ -164,7 +164,7 @@ class IdealTrajectory:
             zip(design.model.a.tolist(), design.model.b.tolist(), strict=True))
 
     def soften(self, gap_u: float) -> bool:
-        """Choose the plan by the noise of the references beside gap_u; return if it changed."""
+        """Choose the plan for the noise of the references and the gap; return if it changed."""
         # Std of u* by each plan for unit noise that is smoothed by the widest parabola.
         of_noise = [plan.noise_gains.item(-1) for plan in self.design.plans]
         now, noise_std = self.softness, self.references.noise.std
