@@ -35,9 +35,9 @@ class Phase(Enum):
 
 
 class Driver(NamedTuple):
-    """What a loop needs from outside. now_ns: clock of the stamps. may_report: may v be reported?
+    """What a loop needs from outside. now_ns: clock of stamps. may_report: if v may be reported.
 
-    applied: topic of these reports. warn: warns the user. steady_s: monotonic. wall_ns: of sent_ns.
+    applied: topic of reports. warn: warns the user. steady_s: monotonic clock. wall_ns: of sent_ns.
     """
 
     now_ns: Callable[[], int]

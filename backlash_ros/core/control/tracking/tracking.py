@@ -113,7 +113,7 @@ class Tracking(ControlStructure):
     # --- at every sample ------------------------------------------------------------------------
 
     def control(self, inputs: ControlInput, inverse: BacklashInverse) -> float:
-        """Return u_d, and let the inverse make v of it."""
+        """Return u_d, and have the inverse compute v from it."""
         y_m, y, estimate, source, limits = inputs
         self.prepare()
         plan, feedback, rest, hand_over = self.trajectory, self.feedback, self.rest, self.hand_over

@@ -58,7 +58,7 @@ class ReferenceWindow:
         self._rows[2, :self._end] = 0.0
 
     def lead_to(self, value: float) -> None:
-        """Bend the window so that it ends at a value that would be a jump from its end."""
+        """Bend the window so that it ends at this value, if that would be a jump from its end."""
         window = self.window
         jump = value - float(window[-1])
         # How the reference got there is not known; an unbent window would show a jump.
