@@ -60,7 +60,7 @@ class AdaptiveController:
         self.compensating, self.lost_samples = True, 0
         self.redesign = Redesign((executor or Executor()).open()) if redesign else None
         self._serial = serial
-        self._led: tuple[float, float, float] | None = None  # the newest v, y_m and u_d
+        self._newest: tuple[float, float, float] | None = None  # the newest v, y_m and u_d
 
     def step(
         self, y: float, y_m: float, lost: int = 0, applied: Sequence[float] = (),
@@ -77,8 +77,8 @@ class AdaptiveController:
                 f'y={y!r}, y_m={y_m!r}, applied={applied!r} and commands={commands!r} must be '
                 f'finite and no larger than {LARGEST_SIGNAL:g}')
         serial, inverse = self._serial, self.inverse
-        if self._led is not None:
-            sent, y_m_before, u_d_before = self._led
+        if self._newest is not None:
+            sent, y_m_before, u_d_before = self._newest
             self.lost_samples += lost
             for i in range(lost + 1):
                 heard, other = y if i == lost else None, nan
@@ -99,7 +99,7 @@ class AdaptiveController:
         self.motion = self.limits.apply(inverse.v, self.motion)
         v = self.motion.v
         inverse.applied(v)
-        self._led = v, y_m, u_d
+        self._newest = v, y_m, u_d
         return ControlStep(y_m, y, u_d, v, estimate)
 
     def refine(self) -> None:

@@ -24,18 +24,18 @@ KEPT_COMMANDS = 256
 
 
 def report_use(p: Parameters) -> str:
-    """Return the effective estimator.use_applied_control; in lockstep every v acts at once: false.
+    """Return the effective use_applied_control: 'false' in lockstep, as every v then acts at once.
 
-    With a delay, auto means false: a driver may report v before or after control.delay_samples.
+    With control.delay_samples 'auto' is 'false', too: v may be reported before or after the delay.
     """
     use: str = p.estimator.use_applied_control
     return 'false' if p.lockstep or (use == 'auto' and p.control.delay_samples > 0) else use
 
 
 class ReportTrust:
-    """Whether reports are used at present: always, never, or (auto) while none are missing.
+    """Decides whether reports are used: always, never, or ('auto') while none are missing.
 
-    With auto they are used from the first one on. A driver that leaves one out among the first
+    With 'auto' they are used from the first one on. A driver that leaves one out among the first
     CONSISTENT has to send as many in a row before they are used again. use: see report_use.
     """
 
@@ -174,7 +174,7 @@ class CommandHistory:
         return nan
 
     def reported_over(self, intervals: int, end_ns: int, unsent: int = 0) -> list[float]:
-        """Return the reports since the last output, one per interval, or [] if not to be used.
+        """Return the reports since the last output, one per interval; [] if incomplete or unused.
 
         unsent: intervals at whose end the driver was held up, and neither measured nor reported:
         the v of its next report acted all the time.
@@ -195,7 +195,7 @@ class CommandHistory:
         return reports if complete else []
 
     def at(self, time_ns: float) -> tuple[float, float]:
-        """Return the newest v that had left by then, and the v next to it that may have acted."""
+        """Return the newest v that had left by then, and one next to it that may act, or nan."""
         later_ns, later = inf, nan
         for i in range(len(self._published) - 1, -1, -1):
             stamp_ns, v = self._published[i]
