@@ -26,7 +26,7 @@ class Period(NamedTuple):
     median: float = nan
 
     def differs_from(self, nominal_s: float, tolerance: float) -> bool:
-        """Whether the mean is certainly off by more than a relative tolerance, like the median."""
+        """Whether the mean is off by more than this fraction for certain, and the median agrees."""
         off = self.mean - nominal_s
         return abs(off) > tolerance * nominal_s + 3.0 * self.std \
             and (self.median - nominal_s) * off > 0.5 * tolerance * nominal_s * abs(off)
@@ -47,7 +47,7 @@ class Timing(NamedTuple):
 
     @property
     def is_stretched(self) -> bool:
-        """Whether pauses make the mean period longer while the median interval is not."""
+        """Whether pauses lengthen the mean period, but not the median interval."""
         mean, std, _ = self.period
         return mean - self.nominal_s > 0.01 * self.nominal_s + 3.0 * std \
             and not self.period.differs_from(self.nominal_s, 0.01)
@@ -219,7 +219,7 @@ class SampleCounter:
         self._early_ns = 0.0  # the earliest time at which the newest sample may have been due
         self._lateness_ns: deque[float] = deque(maxlen=20)  # of the newest samples, unshifted
         self._shifted_ns = 0.0  # by how much due_ns was shifted so far
-        self._on_time = 0  # samples on time, minus twice the early ones
+        self._on_time = 0  # samples on time, minus twice the early ones, but at least 0
         self._strange = 0  # messages in a row that do not follow the newest sample
 
     def count(self, stamp_ns: int, sequence: int = UNNUMBERED, numbered: bool = True,
