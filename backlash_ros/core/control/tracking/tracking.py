@@ -52,8 +52,7 @@ class Tracking(ControlStructure):
         self._noise_std, self._y_noise = noise_std, NoiseLevel()
         self._moves = deque([0.0], maxlen=100)  # sizes of the newest moves of v
         self._engaged_for = 0  # samples since v has crossed the gap
-        # y, the covariance of x_hat and its source at the newest command, until `prepare` takes
-        # them.
+        # y, the covariance of x_hat and its source at the newest command, for `prepare`.
         self._newest: tuple[float, Array | None, Law] | None = None
 
     @property
