@@ -83,8 +83,8 @@ def steiglitz_mcbride(
     for pole in (0.6, 0.95) if poles else (0.0,):
         a: Array = np.atleast_1d(np.poly([pole] * poles))
         for _ in range(steps if poles else 1):
-            back = lfilter([1.0], a, y)
-            columns = np.vstack([-shifted(back, poles + 1)[1:], follows(a), back])
+            filtered = lfilter([1.0], a, y)
+            columns = np.vstack([-shifted(filtered, poles + 1)[1:], follows(a), filtered])
             r = np.asarray(np.linalg.qr(columns[:, rows].T, mode='r'))
             solution = np.linalg.lstsq(r[:, :-1], r[:, -1], rcond=1e-13)[0]
             a = np.append(1.0, solution[:poles])

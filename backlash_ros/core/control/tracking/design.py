@@ -226,9 +226,9 @@ def _agreed(model: StateModel, gain: Gain, length: int) -> tuple[Array, Array]:
     # A Toeplitz matrix without SciPy, which would cost a controller 22 MB.
     ago = np.subtract.outer(np.arange(length), np.arange(length))
     by_u = np.tril(answers[np.maximum(ago, 0)])[1:]
-    share = by_u.sum(axis=1)
-    count = int(np.cumprod(share > 0.0).sum())  # beyond, a larger u is asked to grow further
-    return -by_state[1:count + 1] / share[:count, None], by_u[:count] / share[:count, None]
+    total = by_u.sum(axis=1)
+    count = int(np.cumprod(total > 0.0).sum())  # beyond, a larger u is asked to grow further
+    return -by_state[1:count + 1] / total[:count, None], by_u[:count] / total[:count, None]
 
 
 def _plan(model: StateModel, gains: PreviewGains) -> Plan:

@@ -93,18 +93,18 @@ class ReferenceWindow:
     def _average(self, at: int) -> None:
         # Mean square residual of a parabola, in variances of the noise, up to which it is used in
         # full, and from which on it is not used: there is a step, or a sharp turn.
-        one, none = 1.8, 3.0
+        full, none = 1.8, 3.0
         fits, first, widths = parabolas(self._preview)
-        rest = fits @ self._rows[0, at - widths[-1]:at + widths[-1] + 1]
-        of_noise = rest / self.noise.std  # the square of the rest itself might underflow
-        squares = np.add.reduceat(of_noise * of_noise, first).tolist()
+        residuals = fits @ self._rows[0, at - widths[-1]:at + widths[-1] + 1]
+        in_stds = residuals / self.noise.std  # squares of the residuals themselves might underflow
+        squares = np.add.reduceat(in_stds * in_stds, first).tolist()
         reference = value = self._rows.item(0, at)
         gain = float(self.noise_gains[0])
         for i, (w, row, square) in enumerate(zip(widths, first, squares, strict=True)):
-            share = min((none - square / (2 * w - 2)) / (none - one), 1.0)
-            if share > 0.0:
-                value += share * (reference - rest.item(row + w) - value)
-                gain += share * (self.noise_gains.item(i + 1) - gain)
+            weight = min((none - square / (2 * w - 2)) / (none - full), 1.0)
+            if weight > 0.0:
+                value += weight * (reference - residuals.item(row + w) - value)
+                gain += weight * (self.noise_gains.item(i + 1) - gain)
         self._rows[1, at], self._rows[2, at] = value, gain
 
 
