@@ -39,7 +39,7 @@ class BagError(ValueError):
 
 
 class NoBagError(BagError):
-    """There is no bag where one was looked for."""
+    """There is no bag at the given path."""
 
 
 class Topic(NamedTuple):

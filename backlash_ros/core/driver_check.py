@@ -1,6 +1,6 @@
 """Judge a driver by its ROS graph, its messages and its motion: what is wrong, and the cure.
 
-Each fault is reported once. What it hides is not judged: with the wrong rate nobody knows G(z).
+Each fault is reported once. What it hides is not judged: at a wrong rate G(z) cannot be checked.
 """
 
 from collections.abc import Iterable, Iterator, Sequence

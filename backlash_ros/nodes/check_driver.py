@@ -113,7 +113,7 @@ class CheckDriverNode(ProcessNode):
         if self.ended:
             findings.append(driver_check.Judgement(
                 'drive', driver_check.WRONG, f'{self.ended}: drive ended',
-                'let y come all the time; widen --output-range, or drive less: --amplitude, --rate',
+                'publish y without pause; widen --output-range, or drive less: --amplitude, --rate',
             ))
         print(driver_check.table(findings), flush=True)
         if self.options.save is not None:

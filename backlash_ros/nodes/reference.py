@@ -56,7 +56,7 @@ class ReferenceNode(ProcessNode):
         super().work(executor)
 
     def _follow(self, executor: PromptExecutor) -> None:
-        """Publish y_m half a period after each output, or by the own clock if none comes.
+        """Publish y_m half a period after each output, or by its own clock if none comes.
 
         Outputs are polled: woken by each, the process would take the processor from the controller.
         """
@@ -84,7 +84,7 @@ class ReferenceNode(ProcessNode):
                     pace.waits = False
                     self.log.warning(
                         f'{self._io.topics.output} is not heard here, but by the controller: y_m '
-                        'follows the own clock; start the driver some seconds before'
+                        'follows its own clock; start the driver some seconds before'
                     )
             if now >= pace.due_s:
                 serve_polled(outputs)

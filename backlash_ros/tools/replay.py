@@ -114,9 +114,9 @@ def _one(path: Path, source: Run, parameters: Parameters, out: Path | None) -> N
     elif parted is None:
         print('the estimates are those of the run, to the last bit')
     else:
-        print(f'the estimates part from those of the run at t = {parted.t:.4g} s: {parted.name} '
-              f'was {parted.recorded:.6g} and is {parted.replayed:.6g}; by {parted.largest:.3g} '
-              'standard deviations at most')
+        print(f'the estimates differ from those of the run from t = {parted.t:.4g} s: {parted.name}'
+              f' was {parted.recorded:.6g} and is {parted.replayed:.6g}; at most by '
+              f'{parted.largest:.3g} standard deviations')
     print(directory / 'replay.png', directory / REPORT_PAGE, sep='\n')
 
 

@@ -8,8 +8,8 @@ control.max and control.rate_max have to be set, or --unlimited given.
 axes: the parameter axes, in the section /bringup of the file, lists names; each gets nodes of its
 own in the namespace of that name and a folder DIR/NAME. If one axis fails, all are stopped.
 
-joints: a file with the parameter joints is one controller for all of them, with its recorder. It
-needs --driver; y_m comes from whoever plans the motion. Each joint gets a report in DIR/JOINT.
+joints: a file with the parameter joints is for one controller of all joints, with its recorder. It
+needs --driver; y_m comes from a motion planner. Each joint gets a report in DIR/JOINT.
 
 exit codes: 0 done, 2 bad input, 1 anything else (a process died, nothing moves, interrupted).
 A first Ctrl-C (SIGTERM, SIGHUP) stops all processes in order and reports what was recorded, a

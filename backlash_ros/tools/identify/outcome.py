@@ -290,8 +290,8 @@ def commented_yaml(
     }
     lines = [
         f'# Identified from {source}: {len(found.y)} samples of {found.sample_period:g} s.',
-        f'# {"; ".join(found.remarks)}.' if found.remarks else '# Nothing spoke against it.',
-        '# Values with ± were found, the others are as they were given, or defaults.']
+        f'# {"; ".join(found.remarks)}.' if found.remarks else '# There are no remarks.',
+        '# Values with ± were identified, the others were given or are defaults.']
     path: list[str] = []
     for line in config_text(parameters).splitlines():
         path[(len(line) - len(line.lstrip())) // 2:] = [line.split(':')[0].strip()]

@@ -77,7 +77,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_command_says_that_nothing_parts_or_where(recorded, tmp_path, capsys):
     for option in ('--set', '--sweep'):
         assert main([str(recorded), option, 'plant.uncertainty=0.1', '--out', str(tmp_path)]) == 0
-        assert 'part from those of the run at t = 0.' in capsys.readouterr().out
+        assert 'differ from those of the run from t = 0.' in capsys.readouterr().out
     assert main([str(recorded), '--out', str(tmp_path)]) == 0
     assert 'to the last bit' in capsys.readouterr().out
     names = {path.name for path in tmp_path.iterdir()}
@@ -207,4 +207,4 @@ def test_without_its_reports_a_limiting_driver_is_learned_wrongly(tmp_path, caps
     assert main([str(folder), '--out', str(tmp_path / 'out')]) == 0
     told = capsys.readouterr()
     assert 'holds no applied_control: v is that of control' in told.err
-    assert 'part from those of the run' in told.out
+    assert 'differ from those of the run' in told.out
