@@ -24,14 +24,14 @@ def in_seconds(
         return period * np.arange(count, dtype=np.float64)
     unit_s = unit_s or _guessed_unit(known, period, said)
     t = np.where(np.isfinite(t), t, np.nan)
-    # Clocks that begin anew: 16 or 32 bits, a day, half a day, an hour.
+    # Clocks that wrap around after 16 or 32 bits, a day, half a day, an hour.
     for around in (2.0**16, 2.0**32, *(hours * 3600.0 / unit_s for hours in (24.0, 12.0, 1.0))):
         falls = np.diff(t, prepend=t[0]) < -0.5 * around
         counted = t + around * np.cumsum(falls)
         steps = np.diff(counted)[falls[1:]]
         if 0 < len(steps) < 0.1 * count and (
                 (steps >= 0.0) & (steps <= 3.0 * typical_step(known))).all():
-            said.append(f't begins anew after {seconds(around * unit_s)}: counted on')
+            said.append(f't wraps around after {seconds(around * unit_s)}: continued')
             t = counted
             break
     # The median goes first: large stamps would lose digits when they are scaled.
@@ -78,13 +78,13 @@ def in_order(t: Array, said: list[str], what: str = 'row') -> NDArray[np.intp]:
     steps = np.diff(t[rows])
     if np.count_nonzero(steps < 0.0) > np.count_nonzero(steps > 0.0):
         rows = rows[::-1]
-        said.append(f'the newest {what} stood first: turned around')
+        said.append(f'the newest {what} came first: reversed')
     # Far from the median of the rows around, which bears five bad ones in a row.
     size = min(11, len(rows) - 1 + len(rows) % 2)
     around = np.median(
         sliding_window_view(np.pad(t[rows], size // 2, 'reflect'), size), axis=1)
     bad = np.abs(t[rows] - around) > 50.0 * typical_step(t[rows])
-    # A clock that began anew falls back by several periods; smaller steps back are disorder.
+    # A clock that restarts falls back by several periods; smaller steps back are disorder.
     sound = rows[~bad]
     parts = np.split(sound, np.flatnonzero(np.diff(t[sound]) < -3.0 * typical_step(t[sound])) + 1)
     longest = max(parts, key=len)
@@ -97,7 +97,7 @@ def in_order(t: Array, said: list[str], what: str = 'row') -> NDArray[np.intp]:
     if bad.any():
         said.append(f'{counted(bad.sum(), what)} with a stamp far off left out')
     if len(parts) > 1:
-        said.append(f't begins anew {counted(len(parts) - 1, "time")}: the longest of {len(parts)} '
+        said.append(f't restarts {counted(len(parts) - 1, "time")}: the longest of {len(parts)} '
                     f'parts, {counted(len(longest), what)}, is used')
     if moved:
         said.append(f'{counted(moved, what)} out of order sorted by time')

@@ -64,7 +64,7 @@ def record_of(
     sent = None
     known_v, known_y = np.isfinite(table[1:3])
     if (known_v & known_y).sum() < 0.05 * min(known_v.sum(), known_y.sum()):
-        said.append('v and y stand in rows of their own')
+        said.append('v and y are in separate rows')
         table[1, known_v] = _with_turns_counted('v', table[1, known_v], notes)
         sent = table[:2, known_v]
         table[1, 0] = sent[1, 0]
@@ -108,7 +108,7 @@ def without_turns(
 def _with_turns_counted(name: str, values: Array, notes: list[str]) -> Array:
     values, turn = readings.unwrapped(values)
     if turn:
-        notes.append(f'{name} jumps by {turn:.6g} where it begins anew: the turns are counted')
+        notes.append(f'{name} jumps by {turn:.6g} where it wraps around: the turns are counted')
     return values
 
 
@@ -142,7 +142,7 @@ def _check(**signals: Array) -> None:
         if largest > LARGEST_SIGNAL or 0.0 < swing < 1.0 / LARGEST_SIGNAL:
             raise RecordError(f'{name} reaches {largest:.3g} and swings by {swing:.3g}, beyond '
                               f'{1.0 / LARGEST_SIGNAL:g} to {LARGEST_SIGNAL:g}: choose another '
-                              'unit, drop what is no reading')
+                              'unit, or remove invalid readings')
 
 
 def _held(values: Array) -> Array:
@@ -160,7 +160,7 @@ def on_grid(rows: Rows, period: float | None = None, late: bool = False) -> Reco
     guess = period or (stamps.typical_step(rows.t) if late else _period(rows.t))
     rows, cut = _longest_stretch(rows, guess)
     if len(rows.t) < 2 or not np.isfinite(rows.y).any():
-        raise RecordError(f'{cut}y holds no motion there: cut out one with --from, --to')
+        raise RecordError(f'{cut}y has no readings there: choose a part with --from, --to')
     steps = np.diff(rows.t) / guess
     found = _numbering(rows.t, steps, guess, late)
     used = period or found.period
@@ -212,7 +212,7 @@ def _longest_stretch(rows: Rows, period: float) -> tuple[Rows, str]:
     kept: dict[str, Any] = {name: values[part] for name, values in rows._asdict().items()
                             if np.ndim(values) == 1}
     cut = rows._replace(**kept)
-    return cut, (f'{counted(len(ends) - 2, "long gap")}: the longest stretch, {len(cut.t)} rows, '
+    return cut, (f'{counted(len(ends) - 2, "long break")}: the longest stretch, {len(cut.t)} rows, '
                  'is used; ')
 
 

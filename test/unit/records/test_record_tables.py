@@ -122,7 +122,7 @@ def test_v_and_y_may_stand_in_rows_of_their_own(tmp_path: Path, text: str) -> No
     # v acts from its own time on; before the first one nobody knows it.
     assert record.v.tolist() == V[:len(record.v)].tolist()
     assert record.y.tolist() == Y[:len(record.y)].tolist()
-    assert 'rows of their own' in record.timing
+    assert 'separate rows' in record.timing
 
 
 @pytest.mark.parametrize('word', ['', 'NULL', 'NaN', 'n/a', '-', 'inf'])

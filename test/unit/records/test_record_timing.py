@@ -156,7 +156,7 @@ def test_a_clock_that_begins_anew_is_counted_on(around: float, unit_s: float) ->
     record = record_of(stamps, command(even()), position(even()), unit_s=unit_s)
     assert record.y.tolist() == position(even()).tolist()
     assert record.sample_period == pytest.approx(PERIOD_S, rel=1e-6)
-    assert 'counted on' in record.timing
+    assert 'continued' in record.timing
 
 
 def test_missing_rows_of_even_stamps_are_counted() -> None:
@@ -179,7 +179,7 @@ def test_rows_in_any_order_are_sorted() -> None:
     for k in (100, 300, 500):
         shuffled[[k, k + 1]] = shuffled[[k + 1, k]]
     expected = log(t, noise=0.0).y.tolist()
-    for order, said in ((np.arange(COUNT)[::-1], 'turned around'), (shuffled, 'sorted')):
+    for order, said in ((np.arange(COUNT)[::-1], 'reversed'), (shuffled, 'sorted')):
         record = record_of(t[order], command(t)[order], position(t)[order])
         assert record.y.tolist() == expected
         assert said in record.timing
@@ -201,7 +201,7 @@ def test_stamps_that_are_none_are_left_out_and_counted(bad: float, rows: list[in
 def test_the_longest_run_of_a_log_with_several_is_used() -> None:
     record = log(np.concatenate([even(300), even(700), even(200)]))
     assert len(record.v) == 700
-    assert 'begins anew 2 times' in record.timing
+    assert 'restarts 2 times' in record.timing
 
 
 def test_a_short_gap_is_missing_samples_and_a_long_one_ends_the_record() -> None:
@@ -210,7 +210,7 @@ def test_a_short_gap_is_missing_samples_and_a_long_one_ends_the_record() -> None
     assert set(record.v[499:510]) == {command(even()[499:500])[0]}
     record = log(np.concatenate([even(500), even(700) + 3e5]))
     assert len(record.v) == 700
-    assert 'long gap' in record.timing
+    assert 'long break' in record.timing
 
 
 def test_rows_that_repeat_the_one_before_count_once() -> None:
@@ -310,7 +310,7 @@ def test_an_angle_that_begins_anew_is_unwrapped(turn: float, step: float) -> Non
     assert told == turn
     assert found - found[0] == pytest.approx(angle - angle[0], abs=1e-9 * turn)
     record: Record = record_of(T, MOTION, np.mod(angle, turn))
-    assert any('begins anew' in note for note in record.notes)
+    assert any('wraps around' in note for note in record.notes)
     # Where v and y come in rows of their own, v is what those of v say.
     nothing, shift = np.full(len(T), np.nan), 0.25 * (T[1] - T[0])
     apart: Record = record_of(
@@ -318,7 +318,7 @@ def test_an_angle_that_begins_anew_is_unwrapped(turn: float, step: float) -> Non
         np.column_stack([nothing, np.mod(angle, turn)]).ravel(),
         np.column_stack([MOTION, nothing]).ravel())
     assert np.abs(np.diff(apart.v)).max() < 0.5 * turn
-    assert [note.split()[0] for note in apart.notes if 'begins anew' in note] == ['v']
+    assert [note.split()[0] for note in apart.notes if 'wraps around' in note] == ['v']
 
 
 @pytest.mark.parametrize('values', [
