@@ -83,7 +83,7 @@ class PromptExecutor(SingleThreadedExecutor):
         self.look_if_due(ahead_ns=5_000_000 if self.serve_urgent(max(wait_ns, 0)) else 0)
 
     def serve_urgent(self, wait_ns: int) -> bool:
-        """Wait for messages at most that long and serve one of each topic; returns if any came."""
+        """Wait wait_ns at most and serve one message of each topic; returns whether any came."""
         subscriptions = list(self._node.subscriptions)
         if subscriptions != self._subscriptions or self._wait_set is None:
             self._subscriptions = subscriptions
