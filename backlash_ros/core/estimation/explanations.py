@@ -89,7 +89,8 @@ def afresh(
 ) -> WindowFit | None:
     """The best fit of a search over all gaps, with the spread of rivals; None if none explains y.
 
-    like: fit whose G the search starts from. also: a further starting point. walks: try walks of u.
+    like: fit whose G the search starts from. also: fit to start from, so that the search only has
+    to find other gaps. walks: try walks of u.
     """
     family, swing, first = setup.family, float(np.ptp(record.v)), float(record.v[0])
     if np.isfinite(record.y).sum() < 15 + 2 * family.count or not swing:
@@ -101,11 +102,17 @@ def afresh(
     # If v has not reversed often enough whatever the gap, the fit will hardly be used: be brief.
     hopeless = record.turns(0.01 * swing, first) < setup.turns_needed
     fits, candidates = list[WindowFit](), 1 if hopeless else 3  # number of gaps to fit
+    if also is not None and also.m > 0.0:
+        begin = replace(also.without_intervals, x=np.zeros(1), knots=np.zeros(0),
+                        walk_std=setup.walk_std)
+        fits.append(p.finished(p.fitted(begin, FIRST_STEPS)))
+        xi = fits[0].theta[3:]
+    known = [f.gap for f in fits]
     for _ in range(1 if hopeless else 2):  # the second time around the G of the best fit
         found, null = search(family, record.v, record.y, setup.noise_std, setup.widest, xi)
-        if not found or (not fits and found[0].evidence < null + settings.ENGAGED):
-            break
-        gaps: list[float] = []
+        if not found or found[0].evidence < null + settings.ENGAGED:
+            return None
+        gaps = [*known]
         for evidence, gap, p0, m in found:
             near = evidence > found[0].evidence - settings.FAR_BEHIND and m * found[0].m > 0.0
             if near and len(gaps) < candidates and \
@@ -119,10 +126,6 @@ def afresh(
         if best.valid and best.behind(xi) < 1.0:
             break
         xi = best.theta[3:]
-    if fits and also is not None and also.m > 0.0:
-        begin = replace(also.without_intervals, x=np.zeros(1), knots=np.zeros(0),
-                        walk_std=setup.walk_std)
-        fits.append(p.finished(p.fitted(begin, FIRST_STEPS)))
     different: list[WindowFit] = []
     for f in sorted((f for f in fits if np.isfinite(f.evidence)), key=lambda f: -f.evidence):
         if all(abs(f.gap - g.gap) >= 0.1 * sqrt(max(float(g.cov[2, 2]), 0.0)) for g in different):
