@@ -54,6 +54,8 @@ class Problem:
     ) -> None:
         self.family, self.v, self.nominal = family, v, noise_std
         self.older = older or Prior(np.zeros((0, 3 + family.count)), np.zeros(0))
+        # The prior of the leaks counts once: what older samples say of xi contains it.
+        self._leaks = 0 if self.older.rows[:, 3:].any() else family.leaks
         self.known = np.isfinite(y)
         self.y = np.where(self.known, y, 0.0)
         self.step_of_readings = posterior.step_of(y) if step is None else step
@@ -95,7 +97,7 @@ class Problem:
 
     def log_posterior(self, f: WindowFit, w: Array) -> float:
         """Log-posterior up to a constant; w: weights of the readings (N,). -inf if not finite."""
-        leak, xi = f.theta[3:3 + self.family.leaks], f.theta[3 + self.family.leaks:]
+        leak, xi = f.theta[3:3 + self._leaks], f.theta[3 + self.family.leaks:]
         with np.errstate(all='ignore'):
             run = self.at(f)
             squares = float(xi @ xi) / f.scale**2 + float(leak @ leak)
@@ -178,7 +180,7 @@ class Problem:
             # Weak priors: a gap of the size of the swing of v, p0 anywhere in the present gap.
             tight * (gap + f.gap * target) if held else gap / max(float(np.ptp(self.v)), 1e-300),
             tight * (p0 + f.p0 * target) if begun else begin,
-            *unit[at + 3:at + 3 + self.family.leaks],
+            *unit[at + 3:at + 3 + self._leaks],
             # Keeps X finite where no reading determines it, as when the first ones were lost.
             *(row / (vague * max(float(np.abs(self.y).max()), 1e-300)) for row in unit[:len(x)]),
             *-np.diff([*unit[len(x):at - 1], 0.0 * target], axis=0) / knot_std,
