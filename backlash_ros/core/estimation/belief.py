@@ -111,18 +111,22 @@ def shortened(
 
 
 def _aged(setup: Setup, fit: WindowFit, prior: Prior, samples: int) -> Prior:
-    """The prior, discounted for correlated residuals and widened by drift and walk since then."""
+    """The prior, discounted for correlated residuals, widened by other gaps, drift and walk."""
     discount = sqrt(fit.left.dispersion / fit.inflation)  # cov is inflated by dispersion later on
     rows, values = discount * prior.rows, discount * prior.values
-    if setup.drift.any():
+    wider = np.zeros((len(fit.theta),) * 2)
+    wider[range(3), range(3)] = setup.drift**2 * samples
+    if fit.gap_std**2 > 2.0 * fit.inflation * fit.cov[2, 2]:  # far from normal
+        wider += fit.spread
+    if wider.any():
         try:
             cov = np.linalg.inv(rows.T @ rows)
         except np.linalg.LinAlgError:
             return Prior(rows[:0], values[:0])
-        m, c_r, _ = fit.crossings
-        by = np.array([[1.0, 0.0, 0.0], [c_r, m, 0.0], [0.0, 1.0, -1.0]])  # Jacobian of m, o, g
+        (m, c_r, _), by = fit.crossings, np.eye(len(wider))
+        by[:3, :3] = [[1.0, 0.0, 0.0], [c_r, m, 0.0], [0.0, 1.0, -1.0]]  # Jacobian of m, o, g
         theta = np.linalg.lstsq(rows, values, rcond=None)[0]
-        cov[:3, :3] += by @ np.diag(setup.drift**2 * samples) @ by.T
+        cov += by @ wider @ by.T
         rows = np.linalg.inv(np.linalg.cholesky(cov))
         values = rows @ theta
     if fit.walk_std:  # o has walked since: marginalize it

@@ -104,7 +104,7 @@ def afresh(
     fits, candidates = list[WindowFit](), 1 if hopeless else 3  # number of gaps to fit
     if also is not None and also.m > 0.0:
         begin = replace(also.without_intervals, x=np.zeros(1), knots=np.zeros(0),
-                        walk_std=setup.walk_std)
+                        walk_std=setup.walk_std, spread=np.zeros(()))
         fits.append(p.finished(p.fitted(begin, FIRST_STEPS)))
         xi = fits[0].theta[3:]
     known = [f.gap for f in fits]
@@ -156,24 +156,25 @@ def mixed(p: Problem, best: WindowFit, others: Sequence[WindowFit] = ()) -> Wind
 
 
 def apart(one: WindowFit, other: WindowFit) -> Array:
-    """Outer product (3, 3) of the differences between two fits in m, c_r, c_l."""
-    by = one.crossings - other.crossings
+    """Outer product (3 + K, 3 + K) of the differences between two fits in m, c_r, c_l, xi."""
+    by = np.append(one.crossings - other.crossings, one.theta[3:] - other.theta[3:])
     return np.asarray(np.outer(by, by))
 
 
 def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]:
     """Follow the profile likelihood of the gap, r standard deviations to either side.
 
-    Returns the covariance of m, c_r, c_l (3, 3) beyond that of a normal posterior, which would fall
-    by r^2 / 2, and the fits of other optima, met where it falls by less than half of that.
+    Returns the covariance of m, c_r, c_l, xi (3 + K, 3 + K) beyond a normal posterior, which
+    falls by r^2 / 2, and the fits of other optima, met where it falls by less than half of that.
     """
-    out, beyond = np.zeros((3, 3)), list[WindowFit]()
+    none, beyond = np.zeros((len(best.theta),) * 2), list[WindowFit]()
     if not (best.valid and best.gap > 0.0 and best.cov[2, 2] > 0.0):
-        return out, beyond
+        return none, beyond
     weights, std = p.at(best).weights, sqrt(best.cov[2, 2])
     likeliest, widest = p.log_posterior(best, weights), 2.0 * float(np.ptp(p.v))
+    sides = list[tuple[float, Array]]()
     for away in (-3.0, 3.0):
-        wider, nearer, beside, there = np.zeros((3, 3)), 0.0, None, best
+        wider, nearer, beside, there = none, 0.0, None, best
         for reach in away * 3.0 ** np.arange(6.0):
             gap = best.gap + reach * std
             if not 0.0 < gap < widest:
@@ -192,8 +193,11 @@ def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]
             nearer = behind
         if beside is not None:
             beyond.append(p.finished(p.fitted(beside)))
-        out += 0.5 * wider
-    return out, beyond
+        of_gap = wider[1, 1] + wider[2, 2] - 2.0 * wider[1, 2]
+        sides.append((sqrt(best.cov[2, 2] + of_gap), wider))
+    # A two-piece normal: each side is as probable as it is wide.
+    (left, of_left), (right, of_right) = sides
+    return (left * of_left + right * of_right) / (left + right), beyond
 
 
 def _with_gap(

@@ -98,5 +98,7 @@ def weighed(
     if ahead < 0.0:
         record, fit, rival = record.swapped(swapped), rival, fit
         swapped -= frozenset(range(record.first, record.end))
-    wider = (apart(rival, fit) + rival.crossings_cov) / (1.0 + exp(min(abs(ahead), 700.0)))
+    wider = apart(rival, fit)
+    wider[:3, :3] += rival.crossings_cov
+    wider /= 1.0 + exp(min(abs(ahead), 700.0))
     return record, replace(fit, spread=fit.spread + wider), swapped

@@ -127,7 +127,7 @@ class WindowFit:
     scale: float = 1.0  # most probable s
     cov: Array = field(default_factory=lambda: np.zeros((0, 0)))  # of theta, if residuals are white
     volume: float = 0.0  # log volume of the posterior (Occam factor)
-    spread: Array = field(default_factory=lambda: np.zeros((3, 3)))  # of m, c_r, c_l by other gaps
+    spread: Array = field(default_factory=lambda: np.zeros(()))  # of m, c_r, c_l, xi by other gaps
     left: Left = field(default_factory=Left)
 
     @property
@@ -154,7 +154,8 @@ class WindowFit:
 
     @property
     def cov_xi(self) -> Array:
-        return self.cov[3:, 3:] * self.inflation
+        cov = self.cov[3:, 3:] * self.inflation
+        return np.asarray(cov + self.spread[3:, 3:] if self.spread.ndim else cov)
 
     @property
     def prior_of_xi(self) -> Prior:
@@ -180,7 +181,8 @@ class WindowFit:
         """Covariance of m, c_r, c_l, shape (3, 3)."""
         m, o, _ = self.theta[:3].tolist()
         by = np.array([[1.0, 0.0, 0.0], [-o / m**2, 1.0 / m, 0.0], [-o / m**2, 1.0 / m, -1.0]])
-        return np.asarray(by @ self.cov[:3, :3] @ by.T * self.inflation + self.spread)
+        cov = by @ self.cov[:3, :3] @ by.T * self.inflation
+        return np.asarray(cov + self.spread[:3, :3] if self.spread.ndim else cov)
 
     def alike(self, other: WindowFit) -> bool:
         """Whether the backlashes of two fits differ by no more than chance."""

@@ -183,6 +183,10 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
     look_at, look_below = before.thorough
     if record.end >= look_at or (fit.gap_std < look_below and count <= SHORT_RECORD):
         fit = problem.with_intervals(fit)
+        alone = setup.problem(record)
+        newer = alone.finished(alone.fitted(fit)) if kept.older else fit
+        if newer.valid and not agree(newer.crossings, fit.crossings, newer.crossings_cov):
+            return _adopted(setup, record, newer, None, after)  # what older samples said was wrong
         if count <= SHORT_RECORD and isnan(problem.older.v):
             other = afresh(setup, record, None if kept.older is None else fit, kept.older, fit)
             found = other and setup.is_known(other, settings.REVERSALS)
