@@ -89,8 +89,8 @@ def afresh(
 ) -> WindowFit | None:
     """The best fit of a search over all gaps, with the spread of rivals; None if none explains y.
 
-    like: fit whose G the search starts from. also: fit to start from, so that the search only has
-    to find other gaps. walks: try walks of u.
+    like: fit whose G the search starts from. also: another fit to start from; if it knows its gap,
+    the search starts from its G and looks for other gaps. walks: try walks of u.
     """
     family, swing, first = setup.family, float(np.ptp(record.v)), float(record.v[0])
     if np.isfinite(record.y).sum() < 15 + 2 * family.count or not swing:
@@ -106,13 +106,13 @@ def afresh(
         begin = replace(also.without_intervals, x=np.zeros(1), knots=np.zeros(0),
                         walk_std=setup.walk_std, spread=np.zeros(()))
         fits.append(p.finished(p.fitted(begin, FIRST_STEPS)))
-        xi = fits[0].theta[3:]
-    known = [f.gap for f in fits]
+    known = [f for f in fits if setup.is_known(f, settings.REVERSALS)]
+    xi = known[0].theta[3:] if known else xi
     for _ in range(1 if hopeless else 2):  # the second time around the G of the best fit
         found, null = search(family, record.v, record.y, setup.noise_std, setup.widest, xi)
         if not found or found[0].evidence < null + settings.ENGAGED:
             return None
-        gaps = [*known]
+        gaps = [f.gap for f in known]
         for evidence, gap, p0, m in found:
             near = evidence > found[0].evidence - settings.FAR_BEHIND and m * found[0].m > 0.0
             if near and len(gaps) < candidates and \
@@ -172,7 +172,7 @@ def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]
         return none, beyond
     weights, std = p.at(best).weights, sqrt(best.cov[2, 2])
     likeliest, widest = p.log_posterior(best, weights), 2.0 * float(np.ptp(p.v))
-    sides = list[tuple[float, Array]]()
+    widths, sides = list[float](), list[Array]()
     for away in (-3.0, 3.0):
         wider, nearer, beside, there = none, 0.0, None, best
         for reach in away * 3.0 ** np.arange(6.0):
@@ -194,19 +194,17 @@ def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]
         if beside is not None:
             beyond.append(p.finished(p.fitted(beside)))
         of_gap = wider[1, 1] + wider[2, 2] - 2.0 * wider[1, 2]
-        sides.append((sqrt(best.cov[2, 2] + of_gap), wider))
+        widths.append(sqrt(best.cov[2, 2] + of_gap))
+        sides.append(wider)
     # A two-piece normal: each side is as probable as it is wide.
-    (left, of_left), (right, of_right) = sides
-    return (left * of_left + right * of_right) / (left + right), beyond
+    return np.average(sides, axis=0, weights=widths), beyond
 
 
 def _with_gap(
     p: Problem, near: WindowFit, gap: float, weights: Array, normal: float, close: float,
 ) -> tuple[float, WindowFit]:
-    """The highest log-posterior with this gap, and its fit, starting from a fit near it.
-
-    Other p0 are tried too, unless that is within `close` of `normal` after many reversals.
-    """
+    """The highest log-posterior with this gap, and its fit, starting from a fit near it; after many
+    reversals other p0 are only tried if it is not within `close` of `normal`."""
     v, best, theta = float(p.v[0]), (-inf, near), near.theta.copy()
     theta[2] = gap
     # p0 may block the way to another gap: if it is unknown, also start from both of its ends.

@@ -54,8 +54,7 @@ class Problem:
     ) -> None:
         self.family, self.v, self.nominal = family, v, noise_std
         self.older = older or Prior(np.zeros((0, 3 + family.count)), np.zeros(0))
-        # The prior of the leaks counts once: what older samples say of xi contains it.
-        self._leaks = 0 if self.older.rows[:, 3:].any() else family.leaks
+        self._leaks = 0 if self.older.rows[:, 3:].any() else family.leaks  # prior not counted yet
         self.known = np.isfinite(y)
         self.y = np.where(self.known, y, 0.0)
         self.step_of_readings = posterior.step_of(y) if step is None else step

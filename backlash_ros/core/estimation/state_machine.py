@@ -41,9 +41,8 @@ def learn(setup: Setup, record: Window, before: Belief) -> Belief:
     try:
         with np.errstate(all='ignore'):
             if before.fit is not None and record.is_open:  # late commands are no contradiction
-                p, since = setup.problem(record, kept.older), before.end - setup.family.memory
-                if record.end >= before.thorough[0]:
-                    since = record.first
+                p, thorough = setup.problem(record, kept.older), record.end >= before.thorough[0]
+                since = record.first if thorough else before.end - setup.family.memory
                 record, swapped = likelier(p, before.fit, record, since, kept.swapped)
                 before = before._replace(kept=kept._replace(swapped=swapped))
             return look[before.state](setup, record, before)
