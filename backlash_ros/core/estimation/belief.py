@@ -114,8 +114,7 @@ def _aged(setup: Setup, fit: WindowFit, prior: Prior, samples: int) -> Prior:
     """The prior, discounted for correlated residuals, widened by other gaps, drift and walk."""
     discount = sqrt(fit.left.dispersion / fit.inflation)  # cov is inflated by dispersion later on
     rows, values = discount * prior.rows, discount * prior.values
-    wider = np.zeros((len(fit.theta),) * 2)
-    wider[range(3), range(3)] = setup.drift**2 * samples
+    wider = np.diag(np.append(setup.drift**2 * samples, np.zeros(len(fit.theta) - 3)))
     if fit.gap_std**2 > 2.0 * fit.inflation * fit.cov[2, 2]:  # far from normal
         wider += fit.spread
     if wider.any():

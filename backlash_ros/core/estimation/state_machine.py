@@ -125,8 +125,9 @@ def _why(setup: Setup, found: WindowFit | None, record: Window, before: Belief) 
         return Status.INCONSISTENT if crosses else Status.NOT_EXCITED
     # Until v has crossed the gap, a fit may find next to none: use no less than the first guess.
     gap = max(found.gap, setup.guess)
-    large = found.unexplained * found.gap > settings.NEGLIGIBLE * gap \
-        or record.turns(gap, float(record.v[0])) >= settings.HELD_REVERSALS
+    turns = record.turns(gap, float(record.v[0]))
+    large = turns >= settings.HELD_REVERSALS or (
+        turns >= setup.turns_needed and found.unexplained * found.gap > settings.NEGLIGIBLE * gap)
     wrong = setup.moves_against(found) or (large and found.systematic and setup.noisier(found))
     return Status.INCONSISTENT if wrong or (known and setup.is_known(found)) else Status.ACQUIRING
 
@@ -182,10 +183,6 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
     look_at, look_below = before.thorough
     if record.end >= look_at or (fit.gap_std < look_below and count <= SHORT_RECORD):
         fit = problem.with_intervals(fit)
-        alone = setup.problem(record)
-        newer = alone.finished(alone.fitted(fit)) if kept.older else fit
-        if newer.valid and not agree(newer.crossings, fit.crossings, newer.crossings_cov):
-            return _adopted(setup, record, newer, None, after)  # what older samples said was wrong
         if count <= SHORT_RECORD and isnan(problem.older.v):
             other = afresh(setup, record, None if kept.older is None else fit, kept.older, fit)
             found = other and setup.is_known(other, settings.REVERSALS)

@@ -25,7 +25,7 @@ def coasts(problem: Problem, fit: WindowFit, known: Array | None = None) -> bool
     """
     named = 8.0  # least kappa over its standard deviation; high, as residuals are far from white
     matters = 2e-3  # least unexplained motion over the gap; quantization of slow motion leaves less
-    if not (fit.m > 0.0 and fit.systematic and fit.unexplained > matters):
+    if not (fit.m > 0.0 and fit.left.turns and fit.systematic and fit.unexplained > matters):
         return False
     if known is not None:
         m, c_r, c_l = known.tolist()
