@@ -122,6 +122,8 @@ def afresh(
                 begin = WindowFit(np.zeros(1), p0, theta, noise, walk_std=setup.walk_std)
                 fits.append(p.finished(p.fitted(
                     p.step(begin, 1.0, held=True, begun=True), FIRST_STEPS)))
+        if not fits:  # slopes of 0
+            return None
         best = max(fits, key=lambda f: f.evidence)
         if best.valid and best.behind(xi) < 1.0:
             break
