@@ -109,7 +109,7 @@ def _fitted(setup: explanations.Setup, v: Array, y: Array, bounds: Bounds | None
         problem = setup.problem(record)
         fit = explanations.afresh(setup, record, also=fit) or fit
     reversals = turns(np.append(fit.p0, problem.at(fit).p), 5.0 * fit.gap_std)
-    wanted = settings.REVERSALS if family.count else 1
+    wanted = setup.turns_needed
     values, stds = (fit.crossings * [sign, 1.0, 1.0]).tolist(), fit.crossings_std.tolist()
     doubts = {
         f'v crossed the gap {reversals} times; at least {wanted} are needed to identify both '

@@ -12,7 +12,7 @@ import numpy as np
 from backlash_ros.core.estimation import settings
 from backlash_ros.core.estimation.fit import FIRST_STEPS, Problem
 from backlash_ros.core.estimation.plant_family import PlantFamily
-from backlash_ros.core.estimation.posterior import Prior, WindowFit
+from backlash_ros.core.estimation.posterior import Prior, WindowFit, gap_variance
 from backlash_ros.core.estimation.search import search
 from backlash_ros.core.estimation.unmodelled import with_walk
 from backlash_ros.core.law import OutOfBounds
@@ -56,7 +56,7 @@ class Setup:
         factor = 1.0 / settings.BY_CHANCE if systematic else 1.0
         m, c_r, c_l = map(float, crossings)
         std_m, *std = map(float, np.sqrt(np.maximum(np.diag(cov), 0.0)))
-        gap, gap_std = c_r - c_l, sqrt(max(float(cov[1, 1] + cov[2, 2] - 2.0 * cov[1, 2]), 0.0))
+        gap, gap_std = c_r - c_l, sqrt(gap_variance(cov))
         gap_known = max(gap_std, *std) < factor * settings.STD_GAP * gap
         chance = settings.BY_CHANCE * gap_std
         no_gap = gap < chance and gap + chance < settings.NEGLIGIBLE * self.guess
@@ -195,8 +195,7 @@ def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]
             nearer = behind
         if beside is not None:
             beyond.append(p.finished(p.fitted(beside)))
-        of_gap = wider[1, 1] + wider[2, 2] - 2.0 * wider[1, 2]
-        widths.append(sqrt(best.cov[2, 2] + of_gap))
+        widths.append(sqrt(best.cov[2, 2] + gap_variance(wider)))
         sides.append(wider)
     # A two-piece normal: each side is as probable as it is wide.
     return np.average(sides, axis=0, weights=widths), beyond

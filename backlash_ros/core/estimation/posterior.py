@@ -194,8 +194,7 @@ class WindowFit:
 
     @property
     def gap_std(self) -> float:
-        by = np.array([0.0, 1.0, -1.0])
-        return sqrt(max(float(by @ self.crossings_cov @ by), 0.0))
+        return sqrt(gap_variance(self.crossings_cov))
 
     @property
     def noise(self) -> float:
@@ -223,6 +222,11 @@ class WindowFit:
     def valid(self) -> bool:
         """Whether the slope is positive and the covariance finite."""
         return self.m > 0.0 and self.cov.size > 0 and bool(np.isfinite(self.cov).all())
+
+
+def gap_variance(cov: Array) -> float:
+    """Variance of c_r - c_l, given a covariance of m, c_r, c_l and any others after them."""
+    return max(float(cov[1, 1] + cov[2, 2] - 2.0 * cov[1, 2]), 0.0)
 
 
 def agree(one: Array, other: Array, cov: Array) -> bool:
