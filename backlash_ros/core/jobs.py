@@ -21,6 +21,7 @@ from threading import Event, Thread
 from typing import IO, Any, NamedTuple
 
 Job = Callable[..., Any]
+Message = Sequence[bytes | bytearray | memoryview]  # a pickled object, and the arrays in it
 
 LOST = 'lost'  # kind of Failure if the worker died
 
@@ -94,7 +95,7 @@ class WorkerExecutor(Executor):
 
     def __init__(self, preload: Sequence[str] = (), loops: int = 1) -> None:
         self.restarts, self._arguments = 0, (tuple(preload), loops)
-        self._submitted: SimpleQueue[tuple[Channel, bytes] | None] = SimpleQueue()
+        self._submitted: SimpleQueue[tuple[Channel, Message] | None] = SimpleQueue()
         self._closed = Event()
         self.worker: subprocess.Popen[bytes] | None = None
         self._thread: Thread | None = None
@@ -107,7 +108,10 @@ class WorkerExecutor(Executor):
         return super().open()
 
     def begin(self, channel: Channel, job: Job, args: tuple[Any, ...]) -> None:
-        self._submitted.put((channel, pickle.dumps((job, args), -1)))
+        # The record is not copied, which could take longer than a sample: the thread sends it.
+        record: list[pickle.PickleBuffer] = []
+        body = pickle.dumps((job, args), -1, buffer_callback=record.append)
+        self._submitted.put((channel, [body, *(each.raw() for each in record)]))
 
     def close(self) -> None:
         self._closed.set()
@@ -130,7 +134,7 @@ class WorkerExecutor(Executor):
                     assert self.worker.stdout
                     _send(self.worker.stdin, job)
                     asked = True
-                    body = pickle.load(self.worker.stdout)
+                    body, = _receive(self.worker.stdout)
                     # Unpickled in poll: in this thread it would block the loop at any time.
                     channel.result, deaths = partial(pickle.loads, body), 0
                 # OSError also if a worker cannot be started: no memory, or too many processes.
@@ -170,10 +174,19 @@ def _start(preload: tuple[str, ...], loops: int) -> subprocess.Popen[bytes]:
     return process
 
 
-def _send(stream: IO[bytes], body: bytes) -> None:
-    """Send pickled bytes, pickled once more as one object, so that they are read as a whole."""
-    pickle.dump(body, stream, -1)
+def _send(stream: IO[bytes], message: Message) -> None:
+    pickle.dump([len(part) for part in message], stream, -1)
+    for part in message:
+        stream.write(part)
     stream.flush()
+
+
+def _receive(stream: IO[bytes]) -> list[bytearray]:
+    sizes = pickle.load(stream)
+    parts = [bytearray(stream.read(size)) for size in sizes]
+    if [*map(len, parts)] != sizes:
+        raise EOFError
+    return parts
 
 
 # --- in the worker ------------------------------------------------------------------------------
@@ -201,19 +214,19 @@ def serve(parent: int, preload: Sequence[str], loops: int) -> None:
     credit_s, since = burst_s, time.monotonic()
     with suppress(EOFError, pickle.UnpicklingError):  # no more jobs
         while True:
-            job = pickle.load(sys.stdin.buffer)
+            job = _receive(sys.stdin.buffer)
             began = time.process_time()
-            _send(results, _result_of(job))
+            _send(results, [_result_of(job)])
             credit_s += share * (time.monotonic() - since)
             since = time.monotonic()
             credit_s = min(credit_s, burst_s) - (time.process_time() - began)
             time.sleep(max(-credit_s / share, 0.0))
 
 
-def _result_of(job: bytes) -> bytes:
+def _result_of(job: Message) -> bytes:
     """The pickled result of a pickled job, or a Failure, also if pickling itself fails."""
     try:
-        function, args = pickle.loads(job)
+        function, args = pickle.loads(job[0], buffers=job[1:])
         return pickle.dumps(function(*args), -1)
     except Exception as error:
         return pickle.dumps(Failure(type(error).__name__), -1)

@@ -239,14 +239,11 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
             return
         self._io.serve_waiting()
         steps = self.loops.answer(outputs)
-        turn = next(self.loops.turns)
-        if steps and (turn or self._steps.heard):
+        if steps:
             period_s = self.settings.sample_period
             if next(iter(outputs.values())).received_ns > self._io.now_ns() - period_s * 1e9:
                 # Let the driver, which the command wakes up, have a busy processor first.
                 time.sleep(0.05 * period_s)
-            if turn:
-                turn.core.refine()
             self._follow_up(steps)
 
     def _pair(self, which: int, came: int | Mapping[str, float] | Output) -> None:
@@ -260,10 +257,10 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
             )
             self.loops.take_references(references.popleft())
             if steps := self.loops.answer({'': output}):
-                self.loops.by_name[''].core.refine()
                 self._follow_up(steps)
 
     def _follow_up(self, steps: Mapping[str, ControlStep]) -> None:
+        self.loops.prepare(steps)
         self._steps.publish(self.loops.by_name, steps)
         for joint in self.joints:
             if joint.name in steps:

@@ -103,15 +103,17 @@ class AdaptiveController:
         return ControlStep(y_m, y, u_d, v, estimate)
 
     def refine(self) -> None:
-        """Do the work that the command need not wait for; may be left out if time is short."""
+        """Do work that the command need not wait for; may be left out if time is short."""
         self.structure.prepare()
-        self.estimator.refine()
-        if self.redesign is not None:
-            gains = self.redesign.due(self.estimator.proposal, self.structure, self._serial)
-            if gains is not None:
-                # Both within one sample: x_hat of one model does not fit the gains of another.
-                self._adopt(self.redesign.considered)
-                self.structure.adopt(gains, self._source)
+        redesign, gains = self.redesign, None
+        if redesign is not None:
+            gains = redesign.due(self.estimator.proposal, self.structure, self._serial)
+        if redesign is None or gains is None:
+            self.estimator.refine()
+        else:
+            # Both within one sample: x_hat of one model does not fit the gains of another.
+            self._adopt(redesign.considered)
+            self.structure.adopt(gains, self._source)
 
     def command_of(self, v: float) -> float:
         """The command that holds the motor at rest at the reported v."""

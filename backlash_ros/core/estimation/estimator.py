@@ -189,9 +189,10 @@ class MovingHorizon(Law):
         channel, following, setup = self._channel, self._following, self._setup
         if channel.busy:
             self._accept(channel.poll())
+            return  # to begin the next fit as well would take twice as long
         due = self._record.end >= self._belief.next_at or following.surprised
         resting = following.observer and following.since_motion > setup.family.memory
-        if channel.busy or not due or not self.adapting or resting:
+        if not due or not self.adapting or resting:
             return
         following.beyond += following.surprised  # only once per surprise
         channel.submit(fitted, self._record.since(self._belief.kept.first), setup, self._belief,
@@ -227,8 +228,7 @@ class MovingHorizon(Law):
         std_m, std_c_r, std_c_l = np.sqrt(np.maximum(np.diag(known.cov), 0.0)).tolist()
         fit = belief.fit or belief.found
         if belief.coasts and fit is not None:
-            # A load that moves within the gap makes the gap doubtful: with larger deviations, a
-            # structure that shrinks the gap by them pushes the load less.
+            # The gap is doubtful: a structure that shrinks it by its deviations pushes less.
             doubt = 0.5 * fit.unexplained * fit.gap
             std_c_r, std_c_l = hypot(std_c_r, doubt), hypot(std_c_l, doubt)
         return Estimate(*values, e.f, std_m, std_c_r, std_c_l, e.status)

@@ -22,7 +22,7 @@ from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.estimation.settings import GATE, OUTLIERS, ROWS
 from backlash_ros.core.law import Interval
 from backlash_ros.core.laws.fixed import FixedBacklash
-from backlash_ros.core.plant.backlash import clamp
+from backlash_ros.core.plant.backlash import clamp, play
 from backlash_ros.core.plant.numerics import Gain, gain_of
 from backlash_ros.core.plant.transfer_function import Array, StateModel, TransferFunction, powers
 
@@ -158,7 +158,10 @@ class Following:
             if self.before is not None:
                 self.before.update(y, interval)
         else:
-            self._advance(v, nan if y is None else y, estimate)
+            self._p = clamp(p, v, v + estimate.c_r - estimate.c_l)
+            self.u = estimate.m * (self._p - estimate.c_r)
+            self._u.append(self.u)
+            self._y.append(nan if y is None else y)
             expected, self.innovation = observer.predict(self.u), nan
             if y is not None:
                 self.innovation = innovation = y - expected
@@ -169,12 +172,6 @@ class Following:
                 else:
                     self.outliers += 1
         self.since_motion = self.since_motion + 1 if self._p == p else 0
-
-    def _advance(self, v: float, y: float, estimate: Estimate) -> None:
-        self._p = p = clamp(self._p, v, v + estimate.c_r - estimate.c_l)
-        self.u = u = estimate.m * (p - estimate.c_r)
-        self._u.append(u)
-        self._y.append(y)
 
     def go_on_from(
         self, place: Place, newer: Array, estimate: Estimate, noise_std: float, known: bool,
@@ -189,11 +186,14 @@ class Following:
             return  # another G was adopted meanwhile
         self.observer = observer = self.observer or Observer(self.model, noise_std, self._gains)
         observer.settle(noise_std)
-        self._u, self._y = deque(place.u.tolist(), ROWS), deque(place.y.tolist(), ROWS)
-        self._p, self.u = place.p, estimate.m * (place.p - estimate.c_r)
         observer.place(place.x, known)
-        for v, y in newer.T.tolist():
-            self._advance(v, y, estimate)
-            innovation = y - observer.predict(self.u)
+        v, y = newer
+        p = np.append(place.p, play(v, estimate.c_r - estimate.c_l, place.p) if len(v) else v)
+        u = estimate.m * (p - estimate.c_r)
+        self._p, self.u = float(p[-1]), float(u[-1])
+        self._u = deque([*place.u.tolist(), *u[1:].tolist()], ROWS)
+        self._y = deque([*place.y.tolist(), *y.tolist()], ROWS)
+        for before, after in zip(u[1:].tolist(), y.tolist(), strict=True):
+            innovation = after - observer.predict(before)
             if innovation * innovation <= GATE**2 * observer.variance:  # false if y was lost (nan)
                 observer.correct(innovation)

@@ -1,7 +1,7 @@
 """From outputs to commands, for all joints: count → learn → control → limit → send → report."""
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields
 from enum import Enum
 from functools import partial
@@ -321,8 +321,7 @@ class JointLoops:
     """Answers each message about all joints with one message of commands for all.
 
     driver: returns the Driver of a joint. before: initial estimates, of joints that do not begin
-    with known_before(p). by_name: in the order of `joints`; a single one may be nameless. turns:
-    for each sample, the loop that may attend to its fits then, or None.
+    with known_before(p). by_name: in the order of `joints`; a single one may be nameless.
     """
 
     def __init__(
@@ -341,8 +340,10 @@ class JointLoops:
         }
         self.loops = tuple(self.by_name.values())
         # Attending to fits at every sample would double its cost, and a fit takes longer anyway.
-        pause = max(round(0.05 / p.sample_period / len(self.loops)), 1)  # samples
-        self.turns = cycle([turn for loop in self.loops for turn in (loop, *[None] * (pause - 1))])
+        # Three times in a row: to take up a fit, to adopt a better G, to begin the next fit.
+        pause = 1 if p.lockstep else max(round(0.05 / p.sample_period / len(self.loops)), 1)
+        self._turns = cycle([turn for loop in self.loops for turn in
+                             (*[loop] * min(pause, 3), *[None] * (pause - 3))])
 
     def answer(self, outputs: Mapping[str, Output]) -> dict[str, ControlStep]:
         """Send v(k) for the y(k) of all joints in `outputs`; return the steps that were made."""
@@ -359,11 +360,15 @@ class JointLoops:
             elif (step := loop.answer(outputs[joint], arrival)) is not None:
                 steps[joint] = step
         self._send_waiting()
-        # Work that the next commands then need not wait for.
-        self.counter.sender.learn()
-        for joint in steps:
-            self.by_name[joint].core.structure.prepare()
         return steps
+
+    def prepare(self, joints: Iterable[str]) -> None:
+        """Do the work that the next commands of these joints then need not wait for."""
+        self.counter.sender.learn()
+        for joint in joints:
+            self.by_name[joint].core.structure.prepare()
+        if (loop := next(self._turns)) is not None:
+            loop.core.refine()
 
     def take_references(self, y_m: Mapping[str, float]) -> None:
         for joint, value in y_m.items():
