@@ -151,7 +151,6 @@ class Observed:
         self.rms = float(np.sqrt(np.nanmean(self.residual**2)))
         self.swing = float(np.nanmax(self.y) - np.nanmin(self.y))
         self.family = LinearFamily(self.v[:4000], self.y[:4000])
-        self._candidates: dict[Callable[..., Array], Candidate] = {}
         self.unexplained = self.family.enough and \
             self.rms > max(1.5 * self.noise, 1e-3 * self.swing)
 
@@ -164,7 +163,7 @@ class Observed:
     @cached_property
     def plays(self) -> Candidate:
         """The best set of many plays in parallel."""
-        return self.best(_many, PARALLEL)
+        return self.family.best(_many, PARALLEL)
 
     def share(self, other: Candidate) -> float:
         """Share of what the best play with any G leaves, beyond noise, that `other` explains."""
@@ -172,12 +171,6 @@ class Observed:
         left = float(np.sum(self.residual[self.family.rows]**2))
         one = self.one_play._replace(squares=min(left, self.one_play.squares))
         return min(self.family.share(other, one, self.noise), 1.0)
-
-    def best(self, nonlinearity: Callable[..., Array], starts: Sequence[At]) -> Candidate:
-        """Fit a nonlinearity from these starts, once: later calls return the first result."""
-        if nonlinearity not in self._candidates:
-            self._candidates[nonlinearity] = self.family.best(nonlinearity, starts)
-        return self._candidates[nonlinearity]
 
 
 # --- nonlinearities of v (N,), which is scaled to 0 to 1 ------------------------------------------
@@ -371,7 +364,8 @@ def best_other(o: Observed) -> Answer | None:
     """The best of the nonlinearities that explain y far better than a play; None if none does."""
     f, named = o.family, []
     for nonlinearity, starts, said, cure in NONLINEARITIES:
-        best = o.best(nonlinearity, starts(abs(o.one_play.at[0])))
+        best = o.plays if nonlinearity is _many else \
+            f.best(nonlinearity, starts(abs(o.one_play.at[0])))
         if f.beats(best, o.one_play, o.noise):
             at = f.swing * np.array(best.at)
             named.append((best.squares, said.format(*np.abs(at), places=f.low + at), cure))

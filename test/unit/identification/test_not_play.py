@@ -1,5 +1,6 @@
 """What is not a play is named by what it is; a play, whatever G is behind it, is not."""
 
+import pickle
 import re
 from collections.abc import Callable
 
@@ -12,9 +13,7 @@ from backlash_ros.core.judgement import not_play
 
 Array = NDArray[np.float64]
 
-COUNT = 3000
-GAP = 0.6
-NOISE = 2e-3
+COUNT, GAP, NOISE = 3000, 0.6, 2e-3
 K = np.arange(COUNT)
 V = 2.0 * np.sin(0.02 * K) + 0.9 * np.sin(0.047 * K + 1.0)
 PLANTS: dict[str, tuple[list[float], list[float]]] = {
@@ -75,6 +74,7 @@ OTHERS: dict[str, tuple[Callable[[Array], Array], str]] = {
 
 def named(o: not_play.Observed) -> str:
     answer = not_play.what_it_is(o)
+    assert pickle.loads(pickle.dumps(o)).gap == o.gap
     assert answer.cure
     return answer.reason
 
