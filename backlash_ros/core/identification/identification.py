@@ -126,8 +126,8 @@ def identify(
     units = Units(float(v.mean()), float(np.ptp(v[part])), float(np.nanmedian(y)),
                   float(np.nanstd(y[part])))
     v, y = (v - units.v) / units.v_size, (y - units.y) / units.y_size
-    s = search.searched(
-        v[part], y[part], units, options, options.delays or search.EARLY, progress)
+    s = search.searched(models.Samples(v[part], y[part], 0, 0, 0.0, units), options,
+                        options.delays or search.EARLY, progress)
     if not options.delays:
         s = search.later(s, options, progress)
     progress('fitting the whole record')

@@ -20,14 +20,7 @@ import numpy as np
 from backlash_ros.core.estimation.fit import FEW_STEPS, FIRST_STEPS
 from backlash_ros.core.estimation.posterior import step_of
 from backlash_ros.core.estimation.search import search
-from backlash_ros.core.identification.model import (
-    Model,
-    Samples,
-    Structure,
-    Units,
-    first_model,
-    fitted,
-)
+from backlash_ros.core.identification.model import Model, Samples, Structure, first_model, fitted
 from backlash_ros.core.judgement.deviations import by_model, effective
 from backlash_ros.core.judgement.not_play import Observed, best_other
 from backlash_ros.core.judgement.verdict import ANOTHER
@@ -94,11 +87,12 @@ class StructureSearch(NamedTuple):
 
 
 def searched(
-    v: Array, y: Array, units: Units, options: Options, delays: Sequence[int], progress: Progress,
+    record: Samples, options: Options, delays: Sequence[int], progress: Progress,
 ) -> StructureSearch:
-    """Find the best structure with one of these delays for v and y (N,), centred and scaled."""
+    """Find the best structure with one of these delays for the whole record."""
     progress('searching the gap')
-    samples = Samples(v, y, max(delays) + 1, len(v), step_of(y), units)
+    units, samples = record.units, replace(
+        record, first=max(delays) + 1, last=len(record.v), step=step_of(record.y))
     found = _with_general(samples, delays)
     kept = without_outliers(samples, found[0])
     # If the residual exceeds the quantization step, rounding does not dominate it.
@@ -118,9 +112,10 @@ def searched(
         chosen = selected(compared)
         models = _of_gaps(samples, chosen.whole)
         best = models[0]
-        if not gives_way(best, _eligible(compared)):
+        if not gives_way(best, _eligible(compared)) \
+                and _is_no_plant(best) <= _is_no_plant(chosen.whole):
             break
-        # Only the best fit of a structure shows that a zero cancels a pole.
+        # Only the best fit of a structure shows what it is.
         compared = [one._replace(whole=best) if one is chosen else one for one in compared]
     rows = effective(best.left)
     rivals = [(one.gap, 0.5 * one.behind(best, rows)) for one in models
@@ -233,9 +228,9 @@ def selected(compared: Sequence[Compared]) -> Compared:
 
 
 def _eligible(compared: Sequence[Compared]) -> list[Compared]:
-    """Leave out structures that explain nothing or ring, unless all of them do."""
+    """Leave out structures that explain nothing or are no plant, unless all of them do or are."""
     found = list(compared)
-    for useless in (_explains_nothing, _rings):
+    for useless in (_explains_nothing, _is_no_plant):
         found = [one for one in found if not useless(one.whole)] or found
     return found
 
@@ -245,11 +240,16 @@ def _explains_nothing(found: Model) -> bool:
     return found.squares > float(np.sum(found.problem.y**2))
 
 
-def _rings(found: Model) -> bool:
-    """Whether it has an oscillation that hardly decays over the record, which is no part of G."""
-    lasting = 4.0  # least length of the record, in time constants of the oscillation
-    poles = np.roots(np.append(1.0, found.a))
-    return bool(np.any((poles.imag != 0.0) & (abs(poles) > 1.0 - lasting / len(found.problem.v))))
+def _is_no_plant(found: Model) -> bool:
+    """Whether an oscillation hardly decays over the record, a negative real pole stands in for half
+    a sample less of delay, or an integrator moves y by so little that it stands in for a drift."""
+    # Least length of the record, in time constants of the oscillation; least share of y.
+    lasting, least = 4.0, 0.1
+    poles, gain = np.roots(np.append(1.0, found.a)), found.numerator.sum() / (1.0 + found.a.sum())
+    most = np.where(poles.imag != 0.0, 1.0 - lasting / len(found.problem.v), poles.real)
+    drifts = found.structure.integrator and \
+        abs(gain) * np.cumsum(found.run.u).std() < least * found.run.y.std()
+    return bool(np.any(abs(poles) > most) or drifts)
 
 
 def gives_way(found: Model, compared: Sequence[Compared]) -> bool:
@@ -303,13 +303,13 @@ def later(early: StructureSearch, options: Options, progress: Progress) -> Struc
             break
         progress('searching later delays')
         at = _likeliest_delay(samples, early.best, range(last, latest + 1))
-        late = searched(samples.v, samples.y, samples.units, options,
-                        range(max(at - 2, last), min(at + 2, latest) + 1), progress)
+        late = searched(
+            samples, options, range(max(at - 2, last), min(at + 2, latest) + 1), progress)
         rows, best = effective(late.best.left), early.best
         better = rows * log(max(best.rms, EXACT) / max(late.best.rms, EXACT)) + 0.5 * log(rows) * (
             best.structure.unknowns - late.best.structure.unknowns)
         # Very strong evidence (Kass and Raftery, J. Am. Stat. Assoc. 90 (1995) 773-795).
-        if better <= 5.0:
+        if better <= 5.0 or _is_no_plant(late.best) > _is_no_plant(best):
             return early._replace(delays=[*early.delays, *late.delays], apart=max(
                 early.apart, by_model(best.gap, [(late.best.gap, -2.0 * better)])))
         early = late

@@ -21,8 +21,7 @@ from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.tools.config import read_configuration
 
 PAPER = (np.array([1e-5, 4e-5, 1e-5]), np.array([1.0, -2.88504, 2.77196, -0.88692]))
-SEEDS = range(300, 306)
-MARKS_S = (2.0, 6.0)
+SEEDS, MARKS_S = range(300, 306), (2.0, 6.0)
 
 
 def test_noise_free_example_is_exact_after_one_second() -> None:

@@ -11,9 +11,7 @@ from backlash_ros.core.plant.transfer_function import TransferFunction
 from backlash_ros.core.record_fit import RecordFit, fit_record
 from backlash_ros.core.records.readings import SEARCHED_AT_MOST
 
-NOISE = 1e-3
-TRUTH = Truth()
-MODEL = resonance()
+NOISE, TRUTH, MODEL = 1e-3, Truth(), resonance()
 BOUNDS = Parameters().estimator.bounds
 
 

@@ -15,17 +15,24 @@ from backlash_ros.core.identification.identification import identify
 from backlash_ros.core.judgement.deviations import by_model, covariance_of
 from backlash_ros.core.plant.backlash import play
 
-SAMPLES = models.Samples(np.zeros(2), np.full(2, np.nan), 1, 2, 0.0)
+STILL, SWUNG = (models.Samples(v, np.full(len(v), np.nan), 1, len(v), 0.0)
+                for v in (np.zeros(2), np.sin(0.1 * np.arange(300.0))))
+# Strokes, what a play makes of them, and noise.
+V = np.array(list(islice(strokes(-2.0, 2.0, 8.0, 0.02, 20.0, 0.0), 1000)))
+U = play(V, 0.4, 0.2) - 0.1
+NOISE = 0.002 * np.random.default_rng(8).standard_normal(1000)
 
 
-def model_of(integrator: bool, poles: list[complex], zeros: list[complex]) -> models.Model:
+def model_of(
+    integrator: bool, poles: list[complex], zeros: list[complex], samples: models.Samples = STILL,
+) -> models.Model:
     structure = models.Structure(len(poles) + integrator, 0, integrator)
     a = np.real(np.poly(poles))[1:] if poles else np.empty(0)
     b = np.zeros(structure.numerator_taps)
     b[len(b) - 1 - len(zeros):] = np.real(np.poly(zeros))
     theta = np.concatenate([[1.0, 0.0, 1.0], structure.xi(b, a)])
     fit = WindowFit(np.zeros(1), 0.0, theta, 1.0)
-    return models.Model(structure, SAMPLES.problem(structure), fit)
+    return models.Model(structure, samples.problem(structure), fit)
 
 
 def compared(model: models.Model, held_out: float, criterion: float) -> search.Compared:
@@ -64,28 +71,30 @@ def test_it_gives_way_to_nothing_else_than_the_structure_without_it() -> None:
     assert not search.gives_way(NO_INTEGRATOR.whole, [later, NO_INTEGRATOR])
 
 
+@pytest.mark.parametrize('odd', [
+    model_of(False, [0.5, -0.5], [0.1]), model_of(True, [0.5], [0.9999], SWUNG)])
+def test_what_stands_in_for_half_a_sample_or_for_a_drift_is_taken_only_where_all_do(odd) -> None:
+    plain, better = compared(model_of(False, [0.6], []), 1.2, -20.0), compared(odd, 0.5, -90.0)
+    assert search.selected([plain, better]) is plain
+    assert search.selected([better]) is better
+
+
 def test_a_gain_and_a_delay_have_no_poles_and_can_be_controlled() -> None:
-    rng = np.random.default_rng(8)
-    v = np.array(list(islice(strokes(-2.0, 2.0, 8.0, 0.02, 20.0, 0.0), 1000)))
-    u = play(v, 0.4, 0.2) - 0.1
-    y = np.append(np.zeros(3), 1.7 * u[:-3]) + 0.002 * rng.standard_normal(len(v))
-    found = identify(v, y, 0.02, search.Options((0, 1), (1, 2, 3)))
+    y = np.append(np.zeros(3), 1.7 * U[:-3]) + NOISE
+    found = identify(V, y, 0.02, search.Options((0, 1), (1, 2, 3)))
     assert found.usable
     assert (found.model.delay, found.model.denominator) == (2, (1.0, 0.0))
     assert found.model.numerator == pytest.approx((1.7,), abs=0.01)
     assert found.gap == pytest.approx(0.4, abs=3.0 * found.std['gap'])
     # A delay that may be longer than all that were compared is no narrow gap.
-    edge = identify(v, y, 0.02, search.Options((0,), (0, 1)))
+    edge = identify(V, y, 0.02, search.Options((0,), (0, 1)))
     assert edge.std['gap'] > abs(edge.gap - 0.4) > 0.05
     assert any('longest that was compared' in text for text in edge.remarks)
 
 
 def test_a_delay_beyond_those_that_are_compared_first_is_found() -> None:
-    rng = np.random.default_rng(8)
-    v = np.array(list(islice(strokes(-2.0, 2.0, 8.0, 0.02, 20.0, 0.0), 1000)))
-    u = play(v, 0.4, 0.2) - 0.1
-    y = lfilter([0.0, 0.3], [1.0, -0.7], np.append(np.zeros(12), u[:-12]))
-    found = identify(v, y + 0.002 * rng.standard_normal(len(v)), 0.02, search.Options((1, 2)))
+    y = lfilter([0.0, 0.3], [1.0, -0.7], np.append(np.zeros(12), U[:-12])) + NOISE
+    found = identify(V, y, 0.02, search.Options((1, 2)))
     assert found.model.delay == 12
     assert found.gap == pytest.approx(0.4, abs=4.0 * found.std['gap'])
     assert found.std['gap'] < 0.01
@@ -104,8 +113,7 @@ def test_noise_that_lasts_leaves_a_wider_gap_than_white_noise() -> None:
     white = 0.01 * np.random.default_rng(1).standard_normal(1500)
     own, posterior = std_of_gap(white)
     assert own == pytest.approx(posterior, rel=0.5)
-    lasting = lfilter([0.3], [1.0, -0.9], white)
-    own, posterior = std_of_gap(lasting)
+    own, posterior = std_of_gap(lfilter([0.3], [1.0, -0.9], white))
     assert own > 1.5 * posterior
 
 

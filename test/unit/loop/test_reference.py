@@ -76,8 +76,7 @@ def test_a_reference_file_gives_one_value_per_period(tmp_path: Path) -> None:
 
 PERIOD_S = 0.005
 STEP_S = PERIOD_S / 50.0  # by which the tests let time go on
-S_TO_NS = 1e9
-ROUNDING_S = 1e-9
+S_TO_NS, ROUNDING_S = 1e9, 1e-9
 
 arrival_gaps = st.lists(st.floats(0.05, 6.0), min_size=20, max_size=120)  # periods
 

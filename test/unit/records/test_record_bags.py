@@ -15,8 +15,7 @@ from backlash_ros.tools.records.reading import read_record
 
 NUMBER, NUMBERS = FLOAT, MULTI_ARRAY
 JOINTS = 'sensor_msgs/msg/JointState'
-PERIOD_NS = 5_000_000
-COUNT = 200
+PERIOD_NS, COUNT = 5_000_000, 200
 V = np.sin(0.1 * np.arange(COUNT))
 Y = 0.9 * np.sin(0.1 * np.arange(COUNT) - 0.1)
 STAMPS = 10**18 + PERIOD_NS * np.arange(COUNT)

@@ -12,8 +12,7 @@ from backlash_ros.core.records.stamps import spread_evenly
 from backlash_ros.core.records.time_grid import averaged, record_of
 
 Array = NDArray[np.float64]
-PERIOD_S = 0.01
-COUNT = 1200
+PERIOD_S, COUNT = 0.01, 1200
 
 
 def position(t: Array) -> Array:

@@ -213,8 +213,7 @@ def test_a_log_is_reported_as_what_it_holds(tmp_path, capsys):
     assert (tmp_path / 'out' / 'log.png').exists()
 
 
-PERIOD_NS = 10_000_000
-START_NS = 10**18
+PERIOD_NS, START_NS = 10_000_000, 10**18
 OTHER = Parameters({'estimator.law': 'lms', 'amplitude': 7.0})
 
 

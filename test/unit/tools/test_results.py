@@ -143,8 +143,7 @@ def test_broken_record_is_named(tmp_path: Path, content: bytes) -> None:
         results.read_record(path)
 
 
-T = np.arange(1000) * 0.01
-ONES = np.ones(1000)
+T, ONES = np.arange(1000) * 0.01, np.ones(1000)
 
 
 def record(samples: int = 1000, **signals: object) -> run_record.RunRecord:
