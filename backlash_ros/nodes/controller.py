@@ -86,8 +86,10 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
 
         def look_and_tell() -> None:
             self._steps.look()
-            self._diagnose(next(turns))  # one at a time: all at once would delay a command
+            self._diagnose(next(turns))
 
+        # Apart, as both at once would delay a command.
+        self.every(DIAGNOSTICS_PERIOD_S, self._look_around)
         self.every(DIAGNOSTICS_PERIOD_S / len(self.joints), look_and_tell)
         if p.lockstep:
             self.listen_to_clock(partial(self._pair, 0), KEPT_QOS)
@@ -317,14 +319,15 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
             self.destroy_timer(self._ending)
             self._ending = None
 
+    def _look_around(self) -> None:
+        """Read the graph and the timing of messages, for what is told of all joints."""
+        rivals = tuple(rival.name for rival in self._rivals.found)
+        self._around = (self._io.neighbours(rivals),
+                        self._io.known_of(self.loops.counter.sender.timing()))
+
     def _diagnose(self, *joints: Joint) -> None:
-        # The graph and the timing of messages are read once for all joints.
-        if not joints or joints[0] is self.joints[0]:
-            rivals = tuple(rival.name for rival in self._rivals.found)
-            self._around = (
-                self._io.neighbours(rivals),
-                self._io.known_of(self.loops.counter.sender.timing()),
-            )
+        if not joints:
+            self._look_around()
         for joint in joints or self.joints:
             joint.told = joint.state
             joint.diagnose(*self._around, self._rivals.claim, self.active)
