@@ -23,7 +23,8 @@ from PIL import Image
 from reporting import ROOT, Array, format_table, parser_of, save_film
 
 sys.path.append(str(ROOT / 'examples'))
-os.environ.setdefault('MUJOCO_GL', 'osmesa')  # mujoco reads it when it is imported
+if '--write' in sys.argv:
+    os.environ.setdefault('MUJOCO_GL', 'osmesa')  # mujoco reads it when it is imported
 
 from arm_physics import JOINTS, RESOLUTION, ArmPhysics, Joint
 from joint_trajectory import swing
@@ -121,11 +122,11 @@ def move(p: Parameters, passes: int) -> Motion:
         loops.take_references(dict(zip(NAMES, references[-1], strict=True)))
         loops.answer({name: Output(y, now_ns, now_ns, now_ns, k, numbered=False)
                       for name, y in zip(NAMES, arm.encoders(), strict=True)})
+        loops.prepare(NAMES)
         each = list(loops.by_name.values())
         gaps.append([loop.estimate.c_r - loop.estimate.c_l for loop in each])
         goals = [in_steps(v[name]) for name in NAMES]
         for loop, goal in zip(each, goals, strict=True):
-            loop.core.refine()
             loop.take_applied(goal, now_ns + round(period_s * 1e9))
         arm.move_to(goals)
         arm.advance(period_s)

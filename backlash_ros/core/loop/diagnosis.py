@@ -6,6 +6,7 @@ from enum import IntEnum
 from math import inf, isfinite, nan
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from backlash_ros.core.control.limits import LARGEST_SIGNAL
 from backlash_ros.core.estimate import Status, was_given
 from backlash_ros.core.law import LawReport, OutOfBounds
 from backlash_ros.core.loop.loop_statistics import Counts
@@ -260,15 +261,16 @@ def causes_of(f: LoopFigures) -> tuple[Row, ...]:
                                            if topic.heard else f'nobody publishes it, {start}')
 
     # By samples and the gap if that is known, else by time.
+    valid = f'±{LARGEST_SIGNAL:g}'
     stands_still = f.still >= 20 and f.v_swing > f.gap if isfinite(f.gap) \
         else f.still * period_s >= 5.0 and f.v_swing > 0.0
     return (
         *_unheard(f.around),
         # Useless messages.
         ('bad outputs', warn if f.used else error, f.bad_outputs > TROUBLE * heard,
-         f'{_percent(f.bad_outputs, heard)} of {y} is not a finite number: check the sensor'),
+         f'{_percent(f.bad_outputs, heard)} of {y} is no number within {valid}: check the sensor'),
         ('bad references', warn, f.bad_references > 0, f'{f.bad_references} {y_m} messages '
-         'lately were not finite: the last good one holds'),
+         f'lately were no numbers within {valid}: the last good one holds'),
         ('wraps', warn, f.wraps > 0,
          f'{y} jumps by 2 pi: it is an angle that wraps: let the driver count the turns'),
         # Other nodes.

@@ -89,10 +89,10 @@ CASES: list[tuple[dict[str, Any], Level, str]] = [
     ({'control': TopicFigures('control', peers=(Peer('/driver', 'Float64', 'qos'),))},
      Level.ERROR, 'control does not reach /driver: its QoS does not fit'),
     ({'bad_outputs': 600, 'used': 0}, Level.ERROR,
-     '100 % of plant_output is not a finite number: check the sensor'),
-    ({'bad_outputs': 60}, Level.WARN, '9.09 % of plant_output is not a finite number'),
+     '100 % of plant_output is no number within ±1e+12: check the sensor'),
+    ({'bad_outputs': 60}, Level.WARN, '9.09 % of plant_output is no number within ±1e+12'),
     ({'bad_references': 3, 'reference_silent_s': inf, 'status': None, 'used': 0,
-      'without_reference': 600}, Level.WARN, '3 reference messages lately were not finite'),
+      'without_reference': 600}, Level.WARN, '3 reference messages lately were no numbers'),
     ({'silent_s': 0.5}, Level.WARN, 'no plant_output for 0.5 s: is the driver running? '
      'on_timeout: hold'),
     ({'status': None, 'used': 0, 'output': output_from()}, Level.WARN,
