@@ -33,11 +33,15 @@ class Failure(NamedTuple):
 
 
 class Channel:
-    """Runs one job at a time. busy: whether a job is under way, or its result not polled yet."""
+    """Runs one job at a time. busy: whether a job is under way, or its result not polled yet.
+
+    answer: gives the result, once a worker has sent it. ready: the result itself.
+    """
 
     def __init__(self, executor: 'Executor') -> None:
         self.busy = self.closed = False
-        self.result: Callable[[], Any] | None = None  # set once it is available
+        self.answer: Callable[[], Any] | None = None
+        self.ready: tuple[Any] | None = None
         self._executor = executor
 
     def submit(self, job: Job, *args: Any) -> None:
@@ -49,11 +53,17 @@ class Channel:
         self._executor.begin(self, job, args)
 
     def poll(self) -> Any:
-        """The result of the job, or a Failure, once it is finished; None until then."""
-        if self.result is None:
-            return None
-        result, self.result, self.busy = self.result, None, False
-        return result()
+        """The result of the job, or a Failure, once it is finished; None until then.
+
+        What a worker has sent is unpickled in one call and returned by the next, as both that and
+        the use of it take a good part of a sample.
+        """
+        if self.answer is not None:
+            self.ready, self.answer = (self.answer(),), None
+        elif self.ready is not None:
+            (result,), self.ready, self.busy = self.ready, None, False
+            return result
+        return None
 
     def close(self) -> None:
         """Abandon the job: its result is no longer wanted."""
@@ -78,7 +88,7 @@ class Executor:
             result = job(*args)
         except Exception as error:  # of any kind: the loop goes on without this result
             result = Failure(type(error).__name__)
-        channel.result = lambda: result
+        channel.ready = (result,)
 
     def close(self) -> None:
         """Stop; jobs that are under way are dropped."""
@@ -136,13 +146,13 @@ class WorkerExecutor(Executor):
                     asked = True
                     body, = _receive(self.worker.stdout)
                     # Unpickled in poll: in this thread it would block the loop at any time.
-                    channel.result, deaths = partial(pickle.loads, body), 0
+                    channel.answer, deaths = partial(pickle.loads, body), 0
                 # OSError also if a worker cannot be started: no memory, or too many processes.
                 except (OSError, EOFError, pickle.UnpicklingError):
                     self._end_worker()
                     self.restarts, deaths = self.restarts + 1, deaths + 1
                     if asked:
-                        channel.result = partial(Failure, LOST)
+                        channel.answer = partial(Failure, LOST)
                     if deaths > 1:  # as the previous one did
                         self._closed.wait(min(0.1 * 2.0 ** min(deaths, 7), 10.0))
         self._end_worker()

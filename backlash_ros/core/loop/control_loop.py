@@ -340,10 +340,10 @@ class JointLoops:
         }
         self.loops = tuple(self.by_name.values())
         # Attending to fits at every sample would double its cost, and a fit takes longer anyway.
-        # Three times in a row: to take up a fit, to adopt a better G, to begin the next fit.
+        # Four times in a row: to read and to take up a fit, to adopt its G, to begin the next fit.
         pause = 1 if p.lockstep else max(round(0.05 / p.sample_period / len(self.loops)), 1)
         self._turns = cycle([turn for loop in self.loops for turn in
-                             (*[loop] * min(pause, 3), *[None] * (pause - 3))])
+                             (*[loop] * min(pause, 4), *[None] * (pause - 4))])
 
     def answer(self, outputs: Mapping[str, Output]) -> dict[str, ControlStep]:
         """Send v(k) for the y(k) of all joints in `outputs`; return the steps that were made."""
