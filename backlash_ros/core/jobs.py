@@ -118,10 +118,10 @@ class WorkerExecutor(Executor):
         return super().open()
 
     def begin(self, channel: Channel, job: Job, args: tuple[Any, ...]) -> None:
-        # The record is not copied, which could take longer than a sample: the thread sends it.
-        record: list[pickle.PickleBuffer] = []
-        body = pickle.dumps((job, args), -1, buffer_callback=record.append)
-        self._submitted.put((channel, [body, *(each.raw() for each in record)]))
+        # To copy the record could take longer than a sample: the thread sends arrays as they are.
+        arrays: list[pickle.PickleBuffer] = []
+        body = pickle.dumps((job, args), -1, buffer_callback=arrays.append)
+        self._submitted.put((channel, [body, *(each.raw() for each in arrays)]))
 
     def close(self) -> None:
         self._closed.set()

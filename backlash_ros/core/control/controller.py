@@ -103,11 +103,14 @@ class AdaptiveController:
         return ControlStep(y_m, y, u_d, v, estimate)
 
     def refine(self) -> None:
-        """Do work that the command need not wait for; may be left out if time is short."""
+        """Do work that the command need not wait for: adopt a better G or refine the estimates.
+
+        May be left out if time is short.
+        """
         self.structure.prepare()
-        redesign, gains = self.redesign, None
-        if redesign is not None:
-            gains = redesign.due(self.estimator.proposal, self.structure, self._serial)
+        redesign = self.redesign
+        gains = None if redesign is None else redesign.due(
+            self.estimator.proposal, self.structure, self._serial)
         if redesign is None or gains is None:
             self.estimator.refine()
         else:

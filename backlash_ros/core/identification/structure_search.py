@@ -112,8 +112,8 @@ def searched(
         chosen = selected(compared)
         models = _of_gaps(samples, chosen.whole)
         best = models[0]
-        if not gives_way(best, _eligible(compared)) \
-                and _is_no_plant(best) <= _is_no_plant(chosen.whole):
+        worse = _is_no_plant(best) and not _is_no_plant(chosen.whole)
+        if not (worse or gives_way(best, _eligible(compared))):
             break
         # Only the best fit of a structure shows what it is.
         compared = [one._replace(whole=best) if one is chosen else one for one in compared]
@@ -309,7 +309,7 @@ def later(early: StructureSearch, options: Options, progress: Progress) -> Struc
         better = rows * log(max(best.rms, EXACT) / max(late.best.rms, EXACT)) + 0.5 * log(rows) * (
             best.structure.unknowns - late.best.structure.unknowns)
         # Very strong evidence (Kass and Raftery, J. Am. Stat. Assoc. 90 (1995) 773-795).
-        if better <= 5.0 or _is_no_plant(late.best) > _is_no_plant(best):
+        if better <= 5.0 or (_is_no_plant(late.best) and not _is_no_plant(best)):
             return early._replace(delays=[*early.delays, *late.delays], apart=max(
                 early.apart, by_model(best.gap, [(late.best.gap, -2.0 * better)])))
         early = late

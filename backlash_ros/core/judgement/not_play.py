@@ -163,7 +163,8 @@ class Observed:
     @cached_property
     def plays(self) -> Candidate:
         """The best set of many plays in parallel."""
-        return self.family.best(_many, PARALLEL)
+        return self.family.best(
+            _many, [(widest, share) for widest in (0.1, 0.3, 0.7) for share in (0.0, 0.4)])
 
     def share(self, other: Candidate) -> float:
         """Share of what the best play with any G leaves, beyond noise, that `other` explains."""
@@ -312,14 +313,12 @@ def _creep(o: Observed) -> str:
             'or y drifts')
 
 
-PARALLEL = [(widest, share) for widest in (0.1, 0.3, 0.7) for share in (0.0, 0.4)]  # for _many
-
 # --- what is compared -----------------------------------------------------------------------------
 
-# A nonlinearity; its starts, given the width of the best play; what to say of it, with its
-# parameters as sizes [v] and as `places` [v]; and the cure.
+# A nonlinearity; its starts, given the width of the best play, or None for Observed.plays; what to
+# say of it, with its parameters as sizes [v] and as `places` [v]; and the cure.
 NONLINEARITIES: tuple[tuple[
-    Callable[..., Array], Callable[[float], Sequence[At]], str, str], ...
+    Callable[..., Array], Callable[[float], Sequence[At]] | None, str, str], ...
 ] = (
     (lambda v, width, low, high: np.clip(centred(v, width), min(low, high), max(low, high)),
      lambda width: [
@@ -338,7 +337,7 @@ NONLINEARITIES: tuple[tuple[
      lambda _: [(lead, lead) for lead in (0.003, 0.01, 0.03, 0.1, 0.2, 0.4)],
      'y leads v by {:.3g} where v turns: the drive compensates a backlash already, by too much',
      'switch that off, or leave the compensation to the drive'),
-    (_many, lambda _: PARALLEL,
+    (_many, None,
      'many plays in parallel explain it, up to {:.3g} wide: y turns smoothly, as with friction '
      'along the way or in a piezo', 'only a single backlash is compensated here'),
     (_sticking, lambda width: [(wider * width, share * width) for wider, share in (
@@ -364,8 +363,7 @@ def best_other(o: Observed) -> Answer | None:
     """The best of the nonlinearities that explain y far better than a play; None if none does."""
     f, named = o.family, []
     for nonlinearity, starts, said, cure in NONLINEARITIES:
-        best = o.plays if nonlinearity is _many else \
-            f.best(nonlinearity, starts(abs(o.one_play.at[0])))
+        best = f.best(nonlinearity, starts(abs(o.one_play.at[0]))) if starts else o.plays
         if f.beats(best, o.one_play, o.noise):
             at = f.swing * np.array(best.at)
             named.append((best.squares, said.format(*np.abs(at), places=f.low + at), cure))

@@ -260,8 +260,8 @@ def causes_of(f: LoopFigures) -> tuple[Row, ...]:
         return f'waiting for {topic}: ' + (f'{topic.heard[0]} is there but sends none'
                                            if topic.heard else f'nobody publishes it, {start}')
 
-    # By samples and the gap if that is known, else by time.
     valid = f'±{LARGEST_SIGNAL:g}'
+    # By samples and the gap if that is known, else by time.
     stands_still = f.still >= 20 and f.v_swing > f.gap if isfinite(f.gap) \
         else f.still * period_s >= 5.0 and f.v_swing > 0.0
     return (
