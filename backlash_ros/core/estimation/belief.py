@@ -57,7 +57,7 @@ class Belief(NamedTuple):
     doubt_from: int | None = None  # first sample that contradicts the fit
     end: int = 0
     next_at: int = settings.FIRST_FIT  # sample at which the next fit is due
-    thorough: tuple[int, float] = 0, 0.0  # when a thorough fit is due: sample, std of the gap
+    thorough: tuple[int, float] = 0, 0.0  # when a thorough fit is due: sample, cov[2, 2]
     kept: Kept = Kept()
     trial: Trial = Trial()
     published: Known | None = None

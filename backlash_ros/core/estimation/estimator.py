@@ -174,13 +174,15 @@ class MovingHorizon(Law):
         self._lost_in_a_row = self._lost_in_a_row + 1 if y is None else 0
         following, family = self._following, self._setup.family
         following.step(y, interval, self.estimate)
-        resting = following.since_motion > family.memory  # transients of G have died out
-        if self.adapting and not (resting and not family.integrates):
+        # Nothing is recorded once the transients of G have died out. A v that moves within the gap
+        # is recorded: the true gap may be narrower than it seems.
+        if self.adapting and (family.integrates or following.since_v_moved <= family.memory):
             self._record.append(interval.v, nan if y is None else y, interval.other)
         status = self._belief.reason
         if self._lost_in_a_row >= 20:
             status = Status.NO_DATA
-        elif resting and following.observer is not None and status is not Status.INCONSISTENT:
+        elif following.observer is not None and following.since_motion > family.memory \
+                and status is not Status.INCONSISTENT:
             status = Status.NOT_EXCITED
         if status is not self.estimate.status:
             self.estimate = replace(self.estimate, status=status)
@@ -191,7 +193,7 @@ class MovingHorizon(Law):
             self._accept(channel.poll())
             return  # to begin the next fit as well would take twice as long
         due = self._record.end >= self._belief.next_at or following.surprised
-        resting = following.observer and following.since_motion > setup.family.memory
+        resting = following.observer and following.since_v_moved > setup.family.memory
         if not due or not self.adapting or resting:
             return
         following.beyond += following.surprised  # only once per surprise

@@ -19,7 +19,7 @@ from backlash_ros.core.estimation import posterior
 from backlash_ros.core.estimation.plant_family import Family, sensitivities
 from backlash_ros.core.estimation.posterior import Prior, WindowFit
 from backlash_ros.core.plant.backlash import Region, engaged, play, reversals
-from backlash_ros.core.plant.numerics import lfilter, padded, shifted
+from backlash_ros.core.plant.numerics import lfilter, padded, shifted, step_of
 from backlash_ros.core.plant.transfer_function import Array
 
 STEPS, FIRST_STEPS, FEW_STEPS = 16, 6, 3  # limits on the number of Gauss-Newton steps
@@ -57,7 +57,7 @@ class Problem:
         self._leaks = 0 if self.older.rows[:, 3:].any() else family.leaks  # prior not counted yet
         self.known = np.isfinite(y)
         self.y = np.where(self.known, y, 0.0)
-        self.step_of_readings = posterior.step_of(y) if step is None else step
+        self.step_of_readings = step_of(y) if step is None else step
         self._runs: dict[WindowFit, Run] = {}
 
     def at(self, f: WindowFit) -> Run:
@@ -219,8 +219,9 @@ class Problem:
                     if of_it > value:
                         there = replace(beside, cov=new.cov, scale=new.scale, volume=new.volume)
                         value = of_it
-            if not value > best - 50.0:  # f stays: only its posterior and noise are new
-                f = replace(f, cov=new.cov, scale=new.scale, volume=new.volume)
+            if not value > best - 50.0:  # f stays, and is known no better than before
+                cov = f.cov if f.cov.size else new.cov
+                f = replace(f, cov=cov, scale=new.scale, volume=new.volume)
                 again = f if f.step else self._with_noise(f)
                 if again.noise_std > 0.9 * f.noise_std:
                     return f

@@ -113,9 +113,9 @@ def state_after(model: TransferFunction, u: Array, y: Array) -> Array:
 class Following:
     """Advances the play operator and the state of G from sample to sample.
 
-    The state comes from `before` until a backlash is known, then from `observer`. since_motion:
-    samples since p (before a backlash is known: v) last moved. outliers: readings rejected so far.
-    beyond: readings beyond the gate in a row.
+    The state comes from `before` until a backlash is known, then from `observer`. since_motion,
+    since_v_moved: samples since p and v last moved. outliers: readings rejected so far. beyond:
+    readings beyond the gate in a row.
     """
 
     def __init__(self, model: StateModel, before: FixedBacklash | None) -> None:
@@ -123,8 +123,8 @@ class Following:
         self._gains: Sequence[Gain] = ()
         self.observer: Observer | None = None
         self.u = self.innovation = nan
-        self.since_motion = self.outliers = self.beyond = 0
-        self._p = nan  # v, until a backlash is known
+        self.since_motion = self.since_v_moved = self.outliers = self.beyond = 0
+        self._v = self._p = nan  # p is v until a backlash is known
         # Newest samples, as two queues of floats: pairs would burden the garbage collector.
         self._u, self._y = deque[float](maxlen=ROWS), deque[float](maxlen=ROWS)
 
@@ -172,6 +172,8 @@ class Following:
                 else:
                     self.outliers += 1
         self.since_motion = self.since_motion + 1 if self._p == p else 0
+        self.since_v_moved = self.since_v_moved + 1 if self._v == v else 0
+        self._v = v
 
     def go_on_from(
         self, place: Place, newer: Array, estimate: Estimate, noise_std: float, known: bool,

@@ -16,7 +16,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.plant.numerics import lfilter, padded, shifted
+from backlash_ros.core.plant.numerics import lfilter, padded, product, shifted
 from backlash_ros.core.plant.transfer_function import ON_CIRCLE, Array, TransferFunction, memory_of
 
 
@@ -101,7 +101,7 @@ class PlantFamily:
         b = [0j] * (self._delay + whole - 1) + [
             gain * (x + (lag - whole) * move + width * wide)
             for x, move, wide in zip(*self._taps, strict=True)]
-        a = _product(stable, self._rest, integrator or [1.0])
+        a = product(stable, self._rest, integrator or [1.0])
         while not self.count and not b[-1]:  # trim, unless the length must be the same at all xi
             b.pop()
         length = max(len(a), len(b))
@@ -113,8 +113,8 @@ class PlantFamily:
         a = [1.0 + 0j]
         for omega, damping in ((exp(x), exp(y)) for x, y in pairs):
             r, square = exp(-omega * damping), omega * omega * (1.0 - damping * damping)
-            a = _product(a, [1.0, -2.0 * r * cos(sqrt(square)), r * r])
-        return _product(a, *([1.0, -exp(-exp(value))] for value in logs[2 * self._pairs:]))
+            a = product(a, [1.0, -2.0 * r * cos(sqrt(square)), r * r])
+        return product(a, *([1.0, -exp(-exp(value))] for value in logs[2 * self._pairs:]))
 
     def model_at(self, xi: list[float]) -> TransferFunction:
         b, a = (np.trim_zeros(np.array(x), 'b') for x in ([0.0, *self.at(xi)[0]], self.at(xi)[1]))
@@ -151,15 +151,3 @@ def _sections(poles: NDArray[np.complex128]) -> tuple[int, list[float]]:
         omega = np.sqrt(fast * next_to_it)
         pairs.append((omega, (fast + next_to_it) / 2.0 / omega))
     return len(pairs), np.log([*(q for pair in pairs for q in pair), *real]).tolist()
-
-
-def _product(*factors: Sequence[complex]) -> list[complex]:
-    """Product of polynomials; with so few coefficients faster than np.convolve."""
-    product = [1.0 + 0j]
-    for factor in factors:
-        out = [0j] * (len(product) + len(factor) - 1)
-        for i, x in enumerate(product):
-            for j, y in enumerate(factor):
-                out[i + j] += x * y
-        product = out
-    return product

@@ -31,18 +31,6 @@ class Likelihood(NamedTuple):
     information: Array
 
 
-def step_of(y: Array) -> float:
-    """The quantization step, of which all differences of readings (N,) are multiples; 0 if none."""
-    even = 1e-3  # tolerance of that, in steps
-    different = np.unique(y[np.isfinite(y)])
-    if len(different) < 8:  # distinct readings needed to tell a step
-        return 0.0
-    apart = np.diff(different)
-    apart = apart[apart > even * np.median(apart)]  # not floating-point errors
-    steps = apart / apart.min()
-    return float(apart.min()) if abs(steps - np.round(steps)).max() < even else 0.0
-
-
 def likelihood(r: Array, noise_std: float, step: float, weights: Array) -> Likelihood:
     """Likelihood of readings with residuals r and weights, both (N,); step 0: not quantized."""
     if not step:
@@ -233,9 +221,17 @@ def agree(one: Array, other: Array, cov: Array) -> bool:
     """Whether vectors (n,) agree by a chi-square test; cov: of their difference (n, n)."""
     from scipy.special import chdtri  # late: 31 MB that only fits need
 
-    apart = one - other
-    squares = float(apart @ np.linalg.lstsq(cov, apart, rcond=1e-14)[0])
-    return squares < float(chdtri(len(one), CHANCE))
+    return squares_of(one - other, cov) < float(chdtri(len(one), CHANCE))
+
+
+def squares_of(apart: Array, cov: Array) -> float:
+    """Square of a difference (n,) in standard deviations of its covariance (n, n)."""
+    return float(apart @ np.linalg.lstsq(cov, apart, rcond=1e-14)[0])
+
+
+def log_density(apart: Array, cov: Array) -> float:
+    """Log-density of a difference (n,) of this covariance (n, n), up to a constant."""
+    return -0.5 * (squares_of(apart, cov) + float(np.linalg.slogdet(cov)[1]))
 
 
 def error_of_plant(

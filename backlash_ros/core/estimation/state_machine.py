@@ -12,13 +12,13 @@
 |           |                            |                      | enough                          |
 """
 
-from math import isnan, sqrt
+from math import isnan
 
 import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Status
-from backlash_ros.core.estimation import settings
+from backlash_ros.core.estimation import posterior, settings
 from backlash_ros.core.estimation.belief import Belief, Known, State, Trial, shortened
 from backlash_ros.core.estimation.explanations import Setup, afresh, mixed
 from backlash_ros.core.estimation.fit import FEW_STEPS, Problem
@@ -144,7 +144,7 @@ def _adopted(
         kept=before.kept._replace(first=record.first, older=older),
         trial=Trial(must, 0, fit.noise),
         next_at=record.end + max(count // BLOCKS, FEWEST),
-        thorough=(record.end + count // 4, 0.5 * fit.gap_std),
+        thorough=(record.end + count // 4, 0.25 * float(fit.cov[2, 2])),
     ), fit)
 
 
@@ -180,8 +180,7 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
     after = before._replace(
         end=record.end, next_at=record.end + soon,
         trial=trial._replace(predicted=trial.predicted + count - new))
-    look_at, look_below = before.thorough
-    if record.end >= look_at or (fit.gap_std < look_below and count <= SHORT_RECORD):
+    if record.end >= before.thorough[0] or fit.cov[2, 2] < before.thorough[1]:
         fit = problem.with_intervals(fit)
         if count <= SHORT_RECORD and isnan(problem.older.v):
             other = afresh(setup, record, None if kept.older is None else fit, kept.older, fit)
@@ -194,7 +193,7 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
         elif fit.step or fit.spread.any():  # else the posterior is normal
             fit = mixed(problem, fit)
         fit = with_walk(problem, fit, setup.walk_std)
-        after = after._replace(thorough=(record.end + 2 * count // 5, 0.5 * fit.gap_std))
+        after = after._replace(thorough=(record.end + 2 * count // 5, 0.25 * float(fit.cov[2, 2])))
     else:
         fit = problem.finished(fit)
     if not fit.alike(held):  # not contradicted, but changed: let the next samples decide
@@ -289,34 +288,40 @@ def _published(setup: Setup, belief: Belief, fit: WindowFit) -> Belief:
         return belief
     cov = fit.crossings_cov + np.diag(setup.drift**2 * (belief.end - belief.kept.first) / 3.0)
     cov[1:, 1:] += (fit.walk_std / fit.m) ** 2 * (belief.next_at - belief.end)
-    known = Known(fit.crossings, cov)
-    return belief._replace(published=known, reason=Status.TRACKING, coasts=False)
+    return belief._replace(
+        published=Known(fit.crossings, cov), reason=Status.TRACKING, coasts=False)
 
 
 def _beside_inherited(setup: Setup, belief: Belief, fit: WindowFit, known: Known) -> Belief:
     # Unexplained motion may be gap as well, and the lost motion of a gear varies with its motion.
     replacing = 0.05  # std of the gap over the gap below which samples replace what was known
+    confirming = 2.3  # log odds, against those of another plant, at which samples confirm it
     doubt = (fit.unexplained * fit.gap) ** 2 / 2.0
     cov = fit.crossings_cov + doubt * np.diag([0.0, 1.0, 1.0])
-    gap = known.crossings[1] - known.crossings[2]
-    of_motion = (settings.LOST_MOTION * gap) ** 2 / 2.0
-    prior = known.cov + 1e-18 * np.diag(known.crossings**2 + gap**2)
+    (m, c_r, c_l), apart = known.crossings, fit.crossings - known.crossings
+    size = np.array([m, c_r - c_l, c_r - c_l])
+    prior = known.cov + np.diag((1e-9 * size) ** 2)
     compatible = agree(fit.crossings, known.crossings, cov + prior)
     if not compatible:
-        prior = prior + np.diag([(0.01 * known.crossings[0]) ** 2, of_motion, of_motion])
-    if not agree(fit.crossings, known.crossings, cov + prior):
-        std = sqrt(fit.gap_std**2 + 2.0 * doubt)
+        prior = prior + settings.LOST_MOTION**2 * np.diag(size**2 / [4.0, 2.0, 2.0])
+    alike, another = cov + prior, cov + prior + np.diag(size**2)
+    if not agree(fit.crossings, known.crossings, alike):
         # A gear that is not pure play leaves systematic residuals, which refute nothing.
         white = not fit.systematic and not setup.noisier(fit)
-        sure = std < replacing * fit.gap and white and fit.left.turns >= settings.HELD_REVERSALS
+        sure = white and fit.left.turns >= settings.HELD_REVERSALS and \
+            posterior.gap_variance(cov) < (replacing * fit.gap) ** 2
         if sure and belief.trial.predicted >= belief.trial.must:
             belief = belief._replace(inherited=None)  # it belonged to another plant
         return belief._replace(reason=Status.INCONSISTENT)
-    gain = prior @ np.linalg.pinv(cov + prior)
-    joined = Known(known.crossings + gain @ (fit.crossings - known.crossings), prior - gain @ prior)
+    # Samples that tell little contradict nothing: they must speak for it, against another plant.
+    odds = posterior.log_density(apart, alike) - posterior.log_density(apart, another)
+    # Where both are further apart than their deviations, these were too small (R. T. Birge).
+    widened = prior * max(posterior.squares_of(apart, alike) / len(apart), 1.0)
+    gain = prior @ np.linalg.pinv(alike)
+    joined = Known(known.crossings + gain @ apart, widened - gain @ widened)
     if belief.coasts or (not compatible and fit.systematic):
         joined = known  # a fit that leaves motion unexplained must not move it
-    if not setup.are_precise(*joined, fit.systematic):
+    if odds < confirming or not setup.are_precise(*joined, fit.systematic):
         return belief._replace(reason=Status.ACQUIRING)
     reason = Status.INCONSISTENT if setup.moves_unexplained(fit) else Status.TRACKING
     return belief._replace(published=joined, reason=reason)

@@ -18,12 +18,12 @@ from typing import NamedTuple
 import numpy as np
 
 from backlash_ros.core.estimation.fit import FEW_STEPS, FIRST_STEPS
-from backlash_ros.core.estimation.posterior import step_of
 from backlash_ros.core.estimation.search import search
 from backlash_ros.core.identification.model import Model, Samples, Structure, first_model, fitted
 from backlash_ros.core.judgement.deviations import by_model, effective
 from backlash_ros.core.judgement.not_play import Observed, best_other
 from backlash_ros.core.judgement.verdict import ANOTHER
+from backlash_ros.core.plant.numerics import step_of
 from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.records.readings import noise_of, outliers, quantum
 

@@ -61,6 +61,18 @@ def shifted(x: Array, count: int) -> Array:
     return out
 
 
+def product(*factors: Sequence[complex]) -> list[complex]:
+    """Product of polynomials; with so few coefficients faster than np.convolve."""
+    result = [1.0 + 0j]
+    for factor in factors:
+        out = [0j] * (len(result) + len(factor) - 1)
+        for i, x in enumerate(result):
+            for j, y in enumerate(factor):
+                out[i + j] += x * y
+        result = out
+    return result
+
+
 def is_stable(a: list[float]) -> bool:
     """Whether all roots lie within the unit circle: Schur-Cohn test, faster than finding them."""
     while len(a) > 1:
@@ -245,6 +257,21 @@ class NoiseLevel:
             del self._sorted[bisect_left(self._sorted, self._sizes[0])]
         self._sizes.append(size)
         insort(self._sorted, size)
+
+
+def step_of(y: Array) -> float:
+    """The quantization step, of which all differences of readings (N,) are multiples; 0 if none.
+
+    Unlike `records.readings.quantum` it needs no repeated readings, but all their digits.
+    """
+    even = 1e-3  # tolerance of that, in steps
+    different = np.unique(y[np.isfinite(y)])
+    if len(different) < 8:  # distinct readings needed to tell a step
+        return 0.0
+    apart = np.diff(different)
+    apart = apart[apart > even * np.median(apart)]  # not floating-point errors
+    steps = apart / apart.min()
+    return float(apart.min()) if abs(steps - np.round(steps)).max() < even else 0.0
 
 
 def isolated(flags: NDArray[np.bool_], known: NDArray[np.intp], most: float, run: int) -> \
