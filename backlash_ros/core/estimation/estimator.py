@@ -192,9 +192,9 @@ class MovingHorizon(Law):
         if channel.busy:
             self._accept(channel.poll())
             return  # to begin the next fit as well would take twice as long
-        due = self._record.end >= self._belief.next_at or following.surprised
-        resting = following.observer and following.since_v_moved > setup.family.memory
-        if not due or not self.adapting or resting:
+        resting = following.observer and following.since_motion > setup.family.memory
+        due = self._record.end >= self._belief.next_at and not resting
+        if not self.adapting or not (due or following.surprised):
             return
         following.beyond += following.surprised  # only once per surprise
         channel.submit(fitted, self._record.since(self._belief.kept.first), setup, self._belief,
