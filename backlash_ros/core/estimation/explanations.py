@@ -103,9 +103,9 @@ def afresh(
     hopeless = record.turns(0.01 * swing, first) < setup.turns_needed
     fits, candidates = list[WindowFit](), 1 if hopeless else 3  # number of gaps to fit
     if also is not None and also.m > 0.0:
-        begin = replace(also.without_intervals, x=np.zeros(1), knots=np.zeros(0),
-                        walk_std=setup.walk_std, spread=np.zeros(()))
-        fits.append(p.finished(p.fitted(begin, FIRST_STEPS)))
+        begin = replace(also.without_intervals, knots=np.zeros(0), walk_std=setup.walk_std,
+                        spread=np.zeros(()))
+        fits.append(p.finished(p.fitted(p.begun(begin), FIRST_STEPS)))
     known = [f for f in fits if setup.is_known(f, settings.REVERSALS)]
     xi = known[0].theta[3:] if known else xi
     for _ in range(1 if hopeless else 2):  # the second time around the G of the best fit
@@ -182,8 +182,9 @@ def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]
             if not 0.0 < gap < widest:
                 break
             normal = likeliest - 0.5 * reach**2
-            value, there = _with_gap(p, there, gap, weights, normal, 0.1 * reach**2)
-            if not there.m > 0.0:
+            close = 0.1 * reach**2 if best.left.turns >= settings.HELD_REVERSALS else 0.0
+            value, there = _with_gap(p, there, gap, weights, normal, close)
+            if not there.m > 0.0 or abs(value - normal) < close:
                 break
             behind = max(likeliest - value, 1.0)
             if nearer <= 2.0:  # else the last likely gap may lie far short of this one
@@ -204,8 +205,8 @@ def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]
 def _with_gap(
     p: Problem, near: WindowFit, gap: float, weights: Array, normal: float, close: float,
 ) -> tuple[float, WindowFit]:
-    """The highest log-posterior with this gap, and its fit, starting from a fit near it; after many
-    reversals other p0 are only tried if it is not within `close` of `normal`."""
+    """The highest log-posterior with this gap, and its fit, starting from a fit near it; other p0
+    are only tried if it is not within `close` of `normal`."""
     v, best, theta = float(p.v[0]), (-inf, near), near.theta.copy()
     theta[2] = gap
     # p0 may block the way to another gap: if it is unknown, also start from both of its ends.
@@ -217,8 +218,8 @@ def _with_gap(
                 f, before = p.step(f, held=True, begun=begun), value
                 value = p.log_posterior(f, weights)
                 best = max(best, (value, f), key=lambda one: one[0])
-                if abs(value - before) < 0.1:
+                if value < before + 0.1:
                     break
-        if abs(best[0] - normal) < close and near.left.turns >= settings.HELD_REVERSALS:
+        if abs(best[0] - normal) < close:
             break
     return best
