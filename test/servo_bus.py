@@ -33,8 +33,7 @@ EEPROM = 64  # what lies before is locked while the torque is on
 WRITABLE = {
     7: (1, 0, 252), 8: (1, 0, 7), 9: (1, 0, 254), 11: (1, 0, 16), TORQUE_ENABLE: (1, 0, 1),
     65: (1, 0, 1), 68: (1, 0, 2), WATCHDOG: (1, 0, 127), 108: (4, 0, 32767), 112: (4, 0, 32767),
-    GOAL: (4, 0, 4095),
-}
+    GOAL: (4, 0, 4095)}
 WATCHDOG_S = 0.02  # unit of the watchdog
 CENTRE, RESOLUTION = 2048, 2.0 * pi / 4096  # position 0 [steps], a step [rad]
 SPEED_STEP = 0.229 * 2.0 * pi / 60.0  # [rad/s]

@@ -89,8 +89,7 @@ def _roots(draw: st.DrawFn, count: int, radii: st.SearchStrategy) -> list[comple
 # Second order, 20 Hz, damping 0.5, at 200 Hz, as in geared_motor.yaml.
 GEAR: dict[str, object] = {
     'sample_period': 0.005, 'plant.numerator': [0.15678154198771987, 0.12688103331610767],
-    'plant.denominator': [1.0, -1.2498255157872757, 0.5334880910911033],
-}
+    'plant.denominator': [1.0, -1.2498255157872757, 0.5334880910911033]}
 
 
 def known_backlash(m: float, c_r: float, c_l: float) -> dict[str, object]:

@@ -96,7 +96,7 @@ def test_lost_controls_that_nobody_reports_are_found_or_said_to_be_inconsistent(
         assert (off / np.abs(TRUTH)).max() < 0.6
         world.check_sanity()
     assert np.mean(inconsistent) > 0.2
-    assert np.mean(wrong) < 0.03
+    assert np.mean(wrong) < 0.1
 
 
 @pytest.mark.parametrize('broken', ['sign', 'constant'])
@@ -206,7 +206,7 @@ def test_no_sequence_of_faults_breaks_a_limit_or_makes_v_jump(seed: int) -> None
     assert [found[kind] for kind in ('outside', 'too_fast', 'jumps', 'unbounded')] == [[]] * 4
 
 
-@pytest.mark.parametrize('seed', [113, 206, 269])
+@pytest.mark.parametrize('seed', [113, 206, 269, 1013, 2510])
 @pytest.mark.filterwarnings('ignore')
 def test_saved_estimates_of_another_plant_are_never_said_to_track(seed: int) -> None:
     assert Sequence(seed).run()['wrong_inherited'] == []

@@ -133,11 +133,13 @@ def test_a_bound_that_keeps_a_good_estimate_back_is_named_with_what_was_found(na
 
 
 # The search lets the play begin where it does not, and Gauss-Newton has to pass a kink; neither
-# rounding of slow readings nor a poor fit before the first reversal is a load that coasts.
+# rounding of slow readings nor a poor fit before the first reversal is a load that coasts. Of small
+# moves, one side may say nothing of the gap where the other one says all.
 @pytest.mark.parametrize('what', [
-    'sine 0.5 rad/s; G known', 'sine 0.2 rad/s; exact', 'triangle 1.2 rad/s, swing 1.5'])
-def test_a_slow_motion_is_never_tracked_wrongly_and_blames_nothing(what: str) -> None:
-    cases = (*all_cases([3]), *random_cases(60, 909, 12_000))
+    'sine 0.5 rad/s; G known', 'sine 0.2 rad/s; exact', 'triangle 1.2 rad/s, swing 1.5',
+    'moves 18 rad/s, swing 1.4'])
+def test_a_usual_motion_is_never_tracked_wrongly_and_blames_nothing(what: str) -> None:
+    cases = (*all_cases([3]), *(case for s in (909, 5001) for case in random_cases(60, s, 12_000)))
     assert run_case(next(one for one in cases if one.name.startswith(what))).faults == []
 
 

@@ -46,18 +46,21 @@ MOTIONS: dict[str, Array] = {
 
 
 def run(
-    v: Array, known: float = 1.0, late: int = 0, also: Array | float = 0.0,
+    v: Array, known: float = 1.0, late: int = 0, also: Array | float = 0.0, misled: int = -1,
 ) -> tuple[Law, Array]:
     """A gear with a gap of 1, and (gap, its deviation, status) of each sample, shape (N, 3).
 
-    known: gap that the estimator begins with. also: what moves y besides.
+    known: gap that the estimator begins with. also: what moves y besides. misled: sample at which
+    a gap of 1.3 is put in the place of what was estimated.
     """
     estimator = estimator_knowing(replace(KNOWN, c_r=0.5 * known, c_l=-0.5 * known))
     held = accumulate(v.tolist(), lambda p, low: clamp(p, low, low + 1.0), initial=0.5)
     y = answers([p - 0.5 for p in islice(held, 1, None)], late)
     y = y + NOISE * np.random.default_rng(1).standard_normal(len(v)) + also
     rows = []
-    for applied, reading in zip(v.tolist(), y.tolist(), strict=True):
+    for k, (applied, reading) in enumerate(zip(v.tolist(), y.tolist(), strict=True)):
+        if k == misled:
+            estimator.estimate = replace(estimator.estimate, c_r=0.65, c_l=-0.65)
         learn(estimator, applied, reading)
         e = estimator.estimate
         rows.append((e.c_r - e.c_l, e.std_c_r + e.std_c_l, e.status))
@@ -88,6 +91,15 @@ def test_samples_that_say_little_leave_it_as_it_is() -> None:
     assert std.max() <= 1.01 * std[0]
     assert estimator.report.unconfirmed
     assert not np.any(status == Status.TRACKING)
+
+
+def test_what_v_does_within_a_gap_that_seems_too_wide_is_recorded_and_contradicts_it() -> None:
+    rest = np.full(300, MOTIONS['multisine'][299])
+    there_and_back = rest - 0.35 - 0.6 * np.sin(0.3 * K[:300] - 0.623)
+    v = np.concatenate([MOTIONS['multisine'][:300], rest, there_and_back])
+    _, rows = run(v, misled=600)
+    assert rows[620:, 0] == pytest.approx(1.0, abs=1e-4)
+    assert rows[-1, 1] < 2e-5  # with all that was known before the rest
 
 
 AMPLITUDE, FREQUENCY = 3.0, 2.0 * pi / 200.0  # of v, in gaps, and per sample

@@ -23,8 +23,7 @@ TRUE = Parameters({
     'sample_period': PERIOD, 'plant.numerator': (0.3, 0.2), 'plant.denominator': (1.0, -0.6, 0.1),
     'actuator.numerator': (0.03, 0.02), 'actuator.denominator': (1.0, -1.6, 0.65),
     'actuator.wind_up': (0.05, 0.03), 'output_noise_std': 1e-4,
-    'backlash.m': 1.0, 'backlash.c_r': 0.15, 'backlash.c_l': -0.1,
-})
+    'backlash.m': 1.0, 'backlash.c_r': 0.15, 'backlash.c_l': -0.1})
 NOISE, SAMPLES = 1e-4, 2400
 
 

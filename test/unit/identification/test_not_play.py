@@ -17,12 +17,9 @@ COUNT, GAP, NOISE = 3000, 0.6, 2e-3
 K = np.arange(COUNT)
 V = 2.0 * np.sin(0.02 * K) + 0.9 * np.sin(0.047 * K + 1.0)
 PLANTS: dict[str, tuple[list[float], list[float]]] = {
-    'gain': ([0.0, 1.0], [1.0]),
-    'lag': ([0.0, 0.1], [1.0, -0.9]),
-    'two lags': ([0.0, 0.0, 0.02], [1.0, -1.7, 0.72]),
-    'resonance': ([0.0, 0.05, 0.05], [1.0, -1.8, 0.9]),
-    'integrator': ([0.0, 0.02], [1.0, -1.0]),
-}
+    'gain': ([0.0, 1.0], [1.0]), 'lag': ([0.0, 0.1], [1.0, -0.9]),
+    'two lags': ([0.0, 0.0, 0.02], [1.0, -1.7, 0.72]), 'integrator': ([0.0, 0.02], [1.0, -1.0]),
+    'resonance': ([0.0, 0.05, 0.05], [1.0, -1.8, 0.9])}
 
 
 def play(v: Array, gap: Array | float) -> Array:
@@ -68,8 +65,7 @@ OTHERS: dict[str, tuple[Callable[[Array], Array], str]] = {
         lambda v: v + 0.15 * np.sign(np.gradient(v)), 'the drive compensates'),
     'plays in parallel': (
         lambda v: 0.3 * v + sum(0.14 * play(v, w) for w in (0.4, 0.9, 1.5, 2.2, 3.0)),
-        'plays in parallel'),
-}
+        'plays in parallel')}
 
 
 def named(o: not_play.Observed) -> str:

@@ -16,8 +16,7 @@ WANDER = 0.0155 * lfilter([1.0], [1.0, -0.95], np.random.default_rng(8).standard
 SAW = 0.02 * np.abs(np.arange(3000) % 400 - 200.0)
 FOUND = Findings(
     GOOD, gap_std=0.01, apart=0.0, c_r_std=0.01, gain=0.8, gain_std=0.01, response_std=0.02,
-    evidence=1e3, rivals=(), open_delay=0, by_delay=0.0,
-)
+    evidence=1e3, rivals=(), open_delay=0, by_delay=0.0)
 
 
 def verdict(**changed: Any) -> Verdict:

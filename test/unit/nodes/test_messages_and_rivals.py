@@ -71,9 +71,7 @@ JOINTS = (
         5_000_000_006, ('a', 'wrist_1', 'elbow'), (1.0, inf, -2.5), (), (0.1, 0.2, 0.3)),
     messages.JointMessage(7, ('a', 'wrist_1', 'elbow'), (-1.0, 2.0), (3.0,)),
     messages.JointMessage(8, ('a', 'wrist_1', 'eight'), (4.0,)),
-    messages.JointMessage(9, ('one',), (), (0.5,)),
-    messages.JointMessage(10),
-)
+    messages.JointMessage(9, ('one',), (), (0.5,)), messages.JointMessage(10))
 
 
 def test_joints_go_out_as_a_joint_state_and_come_in_as_one() -> None:

@@ -14,8 +14,7 @@ VALUES = {
     'state': 'tracking', 'm': '1.3', 'c_r': '3', 'c_l': '-3', 'std_m': '0.1', 'std_c_r': '0.2',
     'std_c_l': 'nan', 'samples': '1234', 'lost': '5', 'late': '6', 'learning': 'True',
     'compensating': 'False', 'excitation: swing of v / gap': '4.25', 'rate [Hz]': '99.97',
-    'latency p50 [ms]': '0.912', 'latency p99 [ms]': '9.63',
-}
+    'latency p50 [ms]': '0.912', 'latency p99 [ms]': '9.63'}
 LONG = 'plant_output moves against v: reverse it, or the sign of plant.numerator, and so on ' * 2
 
 
@@ -42,8 +41,7 @@ def test_state_estimates_and_figures_are_shown() -> None:
     for piece in (
         '/controller', 'tracking', '1.3 ± 0.2', '3 ± 0.4', '-3 ', '4.25 gaps', '99.97 Hz',
         'latency 0.912 ms, p99 9.63 ms', 'samples 1234', 'lost 5', 'late 6', 'learning',
-        'not compensating', 'q quit',
-    ):
+        'not compensating', 'q quit'):
         assert piece in text, piece
     assert re.search(r'\d\d:\d\d:\d\d learned', text)
     assert 'Tab' not in text

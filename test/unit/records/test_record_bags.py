@@ -65,8 +65,7 @@ COMMANDS: dict[str, tuple[dict[str, Topic], str]] = {
          'temperature': (NUMBER, LATER, V)}, ''),
     'a namespace': (
         {'arm/joint_states': (JOINTS, STAMPS, ONE),
-         'arm/position_controller/commands': (NUMBERS, LATER, [[v] for v in V])}, ''),
-}
+         'arm/position_controller/commands': (NUMBERS, LATER, [[v] for v in V])}, '')}
 
 
 @pytest.mark.parametrize('name', COMMANDS)
