@@ -105,7 +105,9 @@ def afresh(
     if also is not None and also.m > 0.0:
         begin = replace(also.without_intervals, knots=np.zeros(0), walk_std=setup.walk_std,
                         spread=np.zeros(()))
-        fits.append(p.finished(p.fitted(p.begun(begin), FIRST_STEPS)))
+        # The second one leaves the optimum that `also` is in.
+        fits += [p.finished(p.fitted(f, FIRST_STEPS))
+                 for f in (p.begun(begin), replace(begin, x=np.zeros(1)))]
     known = [f for f in fits if setup.is_known(f, settings.REVERSALS)]
     xi = known[0].theta[3:] if known else xi
     for _ in range(1 if hopeless else 2):  # the second time around the G of the best fit
@@ -182,6 +184,7 @@ def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]
             if not 0.0 < gap < widest:
                 break
             normal = likeliest - 0.5 * reach**2
+            # After many reversals a likelihood that falls like a normal one goes on like that.
             close = 0.1 * reach**2 if best.left.turns >= settings.HELD_REVERSALS else 0.0
             value, there = _with_gap(p, there, gap, weights, normal, close)
             if not there.m > 0.0 or abs(value - normal) < close:

@@ -58,9 +58,10 @@ class PlantFamily:
         self._pairs, self._nominal = _sections(poles[moving])
         a = [x.real for x in self._stable(self._nominal)]
         self._gain, self._delay = sum(a), len(model.denominator) - len(b)
-        # Delay of B and of A at low frequency [samples].
+        # Delay of B and of A at low frequency [samples]. However short, by default a lag of one
+        # sample is usual: a driver may apply v, or read y, a sample later than expected.
         of_b, of_a = (float(np.arange(len(x)) @ x) / (sum(x) or inf) for x in (b, a))
-        late = max(self._delay + of_b - of_a, 1.0)
+        late = max(self._delay + of_b - of_a, 5.0)
         # Prior std and limit of what each xi changes. Limits: a leak of 0.1 a sample,
         # a lag of 40 samples, a factor of 20 on Omega and D. 0.125: acting half a sample late.
         self._scales = [
