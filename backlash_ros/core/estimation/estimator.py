@@ -174,8 +174,8 @@ class MovingHorizon(Law):
         self._lost_in_a_row = self._lost_in_a_row + 1 if y is None else 0
         following, family = self._following, self._setup.family
         following.step(y, interval, self.estimate)
-        # Nothing is recorded once the transients of G have died out. A v that moves within the gap
-        # is recorded: the true gap may be narrower than it seems.
+        # While v rests, nothing is recorded once the transients of G have died out. What v does
+        # within the gap is recorded: the true gap may be narrower than it seems.
         if self.adapting and (family.integrates or following.since_v_moved <= family.memory):
             self._record.append(interval.v, nan if y is None else y, interval.other)
         status = self._belief.reason
