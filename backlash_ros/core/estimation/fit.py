@@ -325,6 +325,6 @@ class Problem:
                 if other.evidence <= best.evidence:
                     break
                 best = other
-        if best.left.rms < 1.5 * f.noise:
+        if best.left.rms < 1.5 * max(f.noise, step / sqrt(12.0)):
             return best
         return self.finished(self.fitted(f.without_intervals))
