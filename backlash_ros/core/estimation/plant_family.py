@@ -16,7 +16,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.plant.numerics import lfilter, padded, product, shifted
+from backlash_ros.core.plant.numerics import lfilter, multiplied, padded, shifted
 from backlash_ros.core.plant.transfer_function import ON_CIRCLE, Array, TransferFunction, memory_of
 
 
@@ -102,7 +102,7 @@ class PlantFamily:
         b = [0j] * (self._delay + whole - 1) + [
             gain * (x + (lag - whole) * move + width * wide)
             for x, move, wide in zip(*self._taps, strict=True)]
-        a = product(stable, self._rest, integrator or [1.0])
+        a = multiplied(stable, self._rest, integrator or [1.0])
         while not self.count and not b[-1]:  # trim, unless the length must be the same at all xi
             b.pop()
         length = max(len(a), len(b))
@@ -114,8 +114,8 @@ class PlantFamily:
         a = [1.0 + 0j]
         for omega, damping in ((exp(x), exp(y)) for x, y in pairs):
             r, square = exp(-omega * damping), omega * omega * (1.0 - damping * damping)
-            a = product(a, [1.0, -2.0 * r * cos(sqrt(square)), r * r])
-        return product(a, *([1.0, -exp(-exp(value))] for value in logs[2 * self._pairs:]))
+            a = multiplied(a, [1.0, -2.0 * r * cos(sqrt(square)), r * r])
+        return multiplied(a, *([1.0, -exp(-exp(value))] for value in logs[2 * self._pairs:]))
 
     def model_at(self, xi: list[float]) -> TransferFunction:
         b, a = (np.trim_zeros(np.array(x), 'b') for x in ([0.0, *self.at(xi)[0]], self.at(xi)[1]))

@@ -61,7 +61,7 @@ def shifted(x: Array, count: int) -> Array:
     return out
 
 
-def product(*factors: Sequence[complex]) -> list[complex]:
+def multiplied(*factors: Sequence[complex]) -> list[complex]:
     """Product of polynomials; with so few coefficients faster than np.convolve."""
     result = [1.0 + 0j]
     for factor in factors:

@@ -140,7 +140,8 @@ def test_a_bound_that_keeps_a_good_estimate_back_is_named_with_what_was_found(na
     'moves 18 rad/s, swing 1.4'])
 def test_a_usual_motion_is_never_tracked_wrongly_and_blames_nothing(what: str) -> None:
     cases = (*all_cases([3]), *(case for s in (909, 5001) for case in random_cases(60, s, 12_000)))
-    assert {*run_case(next(c for c in cases if c.name.startswith(what))).faults} <= {'late'}
+    found = run_case(next(one for one in cases if one.name.startswith(what))).faults
+    assert found == [] or (found == ['late'] and what.startswith('moves'))
 
 
 NOISE = 1e-3

@@ -96,8 +96,7 @@ def test_samples_that_say_little_leave_it_as_it_is() -> None:
 def test_what_v_does_within_a_gap_that_seems_too_wide_is_recorded_and_contradicts_it() -> None:
     rest = np.full(300, MOTIONS['multisine'][299])
     there_and_back = rest - 0.35 - 0.6 * np.sin(0.3 * K[:300] - 0.623)
-    v = np.concatenate([MOTIONS['multisine'][:300], rest, there_and_back])
-    _, rows = run(v, misled=600)
+    _, rows = run(np.concatenate([MOTIONS['multisine'][:300], rest, there_and_back]), misled=600)
     assert rows[620:, 0] == pytest.approx(1.0, abs=1e-4)
     assert rows[-1, 1] < 2e-5  # with all that was known before the rest
 
