@@ -307,7 +307,7 @@ def _beside_inherited(setup: Setup, belief: Belief, fit: WindowFit, known: Known
     alike, another = cov + prior, cov + prior + np.diag(size**2)
     if not agree(fit.crossings, known.crossings, alike):
         # A gear that is not pure play leaves systematic residuals, which refute nothing.
-        white = not fit.systematic and not setup.noisier(fit)
+        white = not fit.systematic
         sure = white and fit.left.turns >= settings.HELD_REVERSALS and \
             posterior.gap_variance(cov) < (replacing * fit.gap) ** 2
         if sure and belief.trial.predicted >= belief.trial.must:
