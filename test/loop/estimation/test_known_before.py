@@ -47,6 +47,7 @@ MOTIONS: dict[str, Array] = {
 
 def run(
     v: Array, known: float = 1.0, late: int = 0, also: Array | float = 0.0, misled: int = -1,
+    noise: float = NOISE,
 ) -> tuple[Law, Array]:
     """A gear with a gap of 1, and (gap, its deviation, status) of each sample, shape (N, 3).
 
@@ -56,7 +57,7 @@ def run(
     estimator = estimator_knowing(replace(KNOWN, c_r=0.5 * known, c_l=-0.5 * known))
     held = accumulate(v.tolist(), lambda p, low: clamp(p, low, low + 1.0), initial=0.5)
     y = answers([p - 0.5 for p in islice(held, 1, None)], late)
-    y = y + NOISE * np.random.default_rng(1).standard_normal(len(v)) + also
+    y = y + noise * np.random.default_rng(1).standard_normal(len(v)) + also
     rows = []
     for k, (applied, reading) in enumerate(zip(v.tolist(), y.tolist(), strict=True)):
         if k == misled:
@@ -67,11 +68,14 @@ def run(
     return estimator, np.array(rows)
 
 
-@pytest.mark.parametrize(('known', 'late', 'motion'), [
-    (0.6, 2, 'triangle'), (0.85, 0, 'multisine'), (1.0, 0, 'sine'),
+@pytest.mark.parametrize(('known', 'late', 'motion', 'noise'), [
+    (0.6, 2, 'triangle', NOISE), (0.85, 0, 'multisine', NOISE), (1.0, 0, 'sine', NOISE),
+    (0.6, 0, 'multisine', 5.0 * NOISE),  # noisier than what was told
 ])
-def test_samples_that_tell_confirm_or_replace_it(known: float, late: int, motion: str) -> None:
-    estimator, rows = run(MOTIONS[motion], known, late)
+def test_samples_that_tell_confirm_or_replace_it(
+    known: float, late: int, motion: str, noise: float,
+) -> None:
+    estimator, rows = run(MOTIONS[motion], known, late, noise=noise)
     gap, std, status = rows.T
     assert not estimator.report.unconfirmed
     assert (status[-1], gap[-1]) == (Status.TRACKING, pytest.approx(1.0, abs=2e-3))

@@ -4,6 +4,7 @@ import pytest
 
 pytest.importorskip('mujoco', reason='the physics need mujoco (requirements/dev.txt)')
 
+from contract.situation_rows import run_gears
 from gear_physics import PRESETS
 from gears import gear_runs
 
@@ -30,3 +31,9 @@ def test_identified_from_limits_alone_the_loop_removes_what_backlash_does(identi
     assert (none - run.error) / (none - best) > 0.9
     assert run.status[-1] == Status.TRACKING
     assert run.said_tracking_off_by(lost) < 0.05
+
+
+def test_a_fit_that_takes_g_to_its_limits_does_not_replace_what_was_identified():
+    runs = run_gears('cnc')
+    assert all(run.usable for run in runs)
+    assert not any(run.wrong for run in runs)
