@@ -128,7 +128,8 @@ class Plan(NamedTuple):
     states: Array  # from z to u* of the next L samples, shape (L, n + 1)
     references: Array  # the same from the references, shape (L, N + 1)
     noise_gains: Array  # see ReferenceWindow
-    x_noise: tuple[Array, ...]  # covariance of x* for unit noise on r, for each width of averaging
+    # For unit noise on r, for each width of averaging: `variances` of x*, (widths + 1, S + 1).
+    x_noise: Array
 
 
 class TrackingDesign(NamedTuple):
@@ -145,10 +146,11 @@ class TrackingDesign(NamedTuple):
     push_ahead: float  # |y| after LOOK_AHEAD samples of u = 1
     holding: list[tuple[Array, Array]]  # see _agreed, for each gain of the schedule
 
-    def variances(self, x_cov: Array) -> Array:
-        """Variances of K x for each gain of the schedule, then of |x|."""
-        gains = np.array(self.schedule)
-        return np.append(((gains @ x_cov) * gains).sum(axis=1), x_cov.trace())
+
+def variances(schedule: Sequence[Gain], x_cov: Array) -> Array:
+    """Variances (S + 1,) of K x for each of S gains of a schedule, then of |x|."""
+    gains = np.array(schedule)
+    return np.append(((gains @ x_cov) * gains).sum(axis=1), x_cov.trace())
 
 
 def design(model: StateModel, weights: TrackingWeights, factor: float = 1.0) -> TrackingDesign:
@@ -158,12 +160,13 @@ def design(model: StateModel, weights: TrackingWeights, factor: float = 1.0) -> 
     # less, any useful feedback leads y astray; without, the backlash is learned before y is lost.
     wrong_slope = 1.35
     rho = weights.input_weight * power_gain(model.transfer_function, np.pi / 10.0)
-    plans = tuple(
-        _plan(model, preview_gains(model, more * rho, weights.integral_weight, weights.preview))
-        for more in SOFTER)
     feedback = feedback_around(model, weights, factor)
     softer = [preview_gains(model, max(more, factor) * rho) for more in SCHEDULE[1:]]
     schedule = feedback.state.tolist(), *(gains.state.tolist() for gains in softer)
+    plans = tuple(
+        _plan(model, schedule, preview_gains(
+            model, more * rho, weights.integral_weight, weights.preview))
+        for more in SOFTER)
     bears = modulus_margin(model, model, softer[SOFTEST - 1], wrong_slope) > 0.0
     # With |G|^2 at a frequency as weight of u^2, feedback acts up to about that frequency.
     gentle = preview_gains(model, power_gain(model.transfer_function, rest_bandwidth)).state
@@ -231,7 +234,7 @@ def _agreed(model: StateModel, gain: Gain, length: int) -> tuple[Array, Array]:
     return -by_state[1:count + 1] / total[:count, None], by_u[:count] / total[:count, None]
 
 
-def _plan(model: StateModel, gains: PreviewGains) -> Plan:
+def _plan(model: StateModel, schedule: Sequence[Gain], gains: PreviewGains) -> Plan:
     n, last = model.order, len(gains.preview) - 1
     length = min(LOOK_AHEAD, last // 3) + 1
     closed = np.eye(n + 1)
@@ -259,11 +262,11 @@ def _plan(model: StateModel, gains: PreviewGains) -> Plan:
         weights = np.convolve(kernel, gains.preview[::-1])
         of_all = np.array([np.convolve(weights, signal) for signal in signals.T])
         u_noise.append(np.linalg.norm(of_all[0]))
-        x_noise.append(of_all[1:] @ of_all[1:].T)
+        x_noise.append(variances(schedule, of_all[1:] @ of_all[1:].T))
     # u* ahead also depends on references that are not averaged yet.
     tail = float(np.linalg.norm(references[:, 2 * last // 3:], axis=1).max())
     return Plan(gains, closed, states, references, np.maximum(np.array(u_noise), tail),
-                tuple(x_noise))
+                np.array(x_noise))
 
 
 def modulus_margin(

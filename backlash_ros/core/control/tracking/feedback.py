@@ -18,7 +18,7 @@ import numpy as np
 
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.structure import LARGEST_FEEDBACK, LARGEST_IN_ACQUISITION
-from backlash_ros.core.control.tracking.design import SOFTEST, TrackingDesign, dot
+from backlash_ros.core.control.tracking.design import SOFTEST, TrackingDesign, dot, variances
 from backlash_ros.core.control.tracking.trajectory import IdealTrajectory
 from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.plant.backlash import GAP, LEFT, RIGHT, Region
@@ -98,6 +98,8 @@ class StateFeedback:
     def use(self, design: TrackingDesign) -> None:
         """Use the gains of this design."""
         self._design = design
+        self._x_cov: Array | None = None  # the newest one, and its `variances`
+        self._of_x_hat: Array = np.zeros(len(design.schedule) + 1)
         self._least = 0.5 * self.y_std * np.array([hypot(*gain) for gain in design.schedule])
         self.noise = DeviationNoise(self._least.tolist())
         # Indices into the schedule: of the hardest gain that noise allows, and of the one in use.
@@ -141,14 +143,14 @@ class StateFeedback:
     def prepare(
         self, x_cov: Array | None, y_std: float, x_noise: Array, reference_std: float,
     ) -> None:
-        """Choose the gain that noise allows; x_noise: covariance of x* for unit noise on r."""
+        """Choose the gain that noise allows; x_noise: see Plan.x_noise."""
         noise, deviation_std = self.noise, 0.0
         noise.x_known = x_cov is not None
         if x_cov is not None:
-            of_x_hat = self._design.variances(x_cov)
-            of_both = of_x_hat + reference_std**2 * self._design.variances(x_noise)
-            stds = np.sqrt(np.maximum(of_both, 0.0))
-            noise.x_std = max(of_x_hat.item(-1), 0.0)**0.5
+            if x_cov is not self._x_cov:  # it changes with a fit, not with every sample
+                self._x_cov, self._of_x_hat = x_cov, variances(self._design.schedule, x_cov)
+            stds = np.sqrt(np.maximum(self._of_x_hat + reference_std**2 * x_noise, 0.0))
+            noise.x_std = max(self._of_x_hat.item(-1), 0.0)**0.5
             noise.u_std, deviation_std = np.maximum(stds[:-1], self._least).tolist(), stds.item(-1)
         # As much as v may leave uncorrected at rest: the same rule for motion and rest.
         noise.ignored = ARRIVED * max(CLOSE * y_std, UNCERTAIN * noise.x_std)

@@ -260,7 +260,7 @@ class IdealTrajectory:
 
     @property
     def noise(self) -> tuple[Array, float]:
-        """Covariance of x* for unit noise on references smoothed like these, std of their noise."""
+        """Plan.x_noise for references smoothed like these, and the std of their noise."""
         by_width = np.abs(self._plan.noise_gains - self.references.u_noise_gain)
         return self._plan.x_noise[int(by_width.argmin())], self.references.noise.std
 
