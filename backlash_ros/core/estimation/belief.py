@@ -93,13 +93,12 @@ def shortened(
     if cut < count // 6:
         return belief, fit
     rest = record.between(record.first + cut)
-    old = setup.problem(record.between(record.first, rest.first), kept.older)
-    p = old.at(fit).p
-    side = engaged(old.v, p, fit.gap)[-1]
+    p = problem.at(fit).p[:cut]
+    side = engaged(record.v[:cut], p, fit.gap)[-1]
     left = bool(side == Region.LEFT)
     v = nan if side == Region.GAP else float(p[-1] - fit.gap if left else p[-1])
     begin = replace(fit, p0=float(p[-1]), x=np.zeros(len(fit.x)), knots=np.zeros(0))
-    older = _aged(setup, fit, old.remembered(replace(fit, knots=begin.knots)), cut)
+    older = _aged(setup, fit, problem.remembered(fit, cut), cut)
     for beside in (older._replace(v=v, left=left), None):
         problem = setup.problem(rest, beside)
         shorter = problem.finished(problem.fitted(problem.begun(begin)))

@@ -121,7 +121,7 @@ class Problem:
         """
         from scipy.linalg.lapack import dtrtri  # late: 31 MB that only fits need
 
-        r, run = self._triangle(f, held, begun), self.at(f)
+        r, run = _triangle(self.rows(f, held, begun)), self.at(f)
         if not np.isfinite(r).all():
             raise np.linalg.LinAlgError('the samples leave no finite posterior')
         # eta, all unknowns but the error of G, is R11^-1 (d1 - R12 xi) + R11^-1 noise.
@@ -148,17 +148,15 @@ class Problem:
             p0=min(max(p0, first), first + gap) if isnan(self.older.v) else p0,
             scale=scale, cov=cov[at:, at:], volume=volume - len(knots) * log(knot_std))
 
-    def remembered(self, f: WindowFit) -> Prior:
-        """What this record and older samples say of theta, without the prior N(0, s^2) of xi."""
-        r = self._triangle(f, False, False)
+    def remembered(self, f: WindowFit, count: int) -> Prior:
+        """What the first `count` samples and older ones say of theta, without the prior of xi."""
+        number = np.full(len(self.v), -1)
+        number[self.known] = self.at(f).number
+        told = ~np.isin(number[:count], number[count:])  # else the rest of the record tells it, too
+        rows = self.rows(f)
+        r = _triangle(np.vstack([rows[:count][told], rows[len(self.v):]]))
         at = len(r) - 4 - self.family.count
         return Prior(r[at:-1, at:-1], r[at:-1, -1])
-
-    def _triangle(self, f: WindowFit, held: bool, begun: bool) -> Array:
-        from scipy.linalg.lapack import dgeqrf  # as above
-
-        rows = self.rows(f, held, begun)
-        return np.asarray(np.triu(dgeqrf(rows, overwrite_a=1)[0][:rows.shape[1]]))
 
     def rows(self, f: WindowFit, held: bool = False, begun: bool = False) -> Array:
         """Least-squares rows of a step: N samples, B priors; target last, (N + B, P + 1)."""
@@ -328,3 +326,9 @@ class Problem:
         if best.left.rms < 1.5 * max(f.noise, step / sqrt(12.0)):
             return best
         return self.finished(self.fitted(f.without_intervals))
+
+
+def _triangle(rows: Array) -> Array:
+    from scipy.linalg.lapack import dgeqrf  # late: 31 MB that only fits need
+
+    return np.asarray(np.triu(dgeqrf(rows, overwrite_a=1)[0][:rows.shape[1]]))
