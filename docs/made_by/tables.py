@@ -1,6 +1,5 @@
 """The runs and the tables with numbers that `make docs` writes, and the page of parameters."""
 
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -9,7 +8,6 @@ from pathlib import Path
 import combinations_of_laws
 import numpy as np
 import printed_law
-from reporting import ROOT
 from reporting import markdown_table as markdown
 
 from backlash_ros.core import Parameters, Status, build_closed_loop
@@ -84,11 +82,8 @@ def _allowed(p: Parameter) -> str:
 
 
 
-
 NAMES = ('m', 'c_r', 'c_l')
 SECONDS = 10.0
-DISTURBANCE = 2.0
-SETTINGS = ROOT / 'backlash_ros' / 'core' / 'estimation' / 'settings.py'
 MOTOR = 'geared_motor.yaml'
 # True plants that differ from the G(z) of MOTOR, by what is set.
 TRUE_PLANTS: dict[str, dict[str, str]] = {
@@ -154,20 +149,6 @@ def printed_growth() -> str:
         for f in (0.22, 0.5, 1.0)])
 
 
-def disturbance() -> str:
-    """Effective crossings under a constant disturbance of u."""
-    run = simulate(6.0, {'input_disturbance': f'{DISTURBANCE:g}'}).record
-    m, c_r, c_l = (float(run.column(f'true_{name}')[-1]) for name in NAMES)
-    shift = -DISTURBANCE / m
-    last = run.column('t') > run.column('t')[-1] - 1.0
-    e = (run.column('u') + DISTURBANCE - run.column('u_d'))[last]
-    expected = {'m': m, 'c_r': c_r + shift, 'c_l': c_l + shift}
-    rows = [(f'`{name}`', f'{run.column(f"true_{name}")[-1]:.6g}', f'{value:.6g}',
-             f'{run.column(name)[-1]:.6g}') for name, value in expected.items()]
-    rows.append(('RMS of u + d − u_d, last second', '', '0', f'{np.sqrt(np.mean(e**2)):.1g}'))
-    return markdown(('', 'backlash alone', 'shifted by −d/m', 'estimated'), rows)
-
-
 def uncertain_plants() -> str:
     """What is learned where the true plant is not G, with G believed and with the default."""
     rows = []
@@ -207,16 +188,8 @@ def _percent(share: complex) -> str:
     return f'{percent:.0f} %' if percent >= 10.0 or percent < 1e-9 else f'{percent:.2g} %'
 
 
-def estimator_constants() -> str:
-    """What the method is tuned by, with the comment behind it, as it stands in the code."""
-    found = re.findall(r'^([A-Z_]+) = ([^#\n]+?) *# (.+)$', SETTINGS.read_text(), re.MULTILINE)
-    return markdown(('constant', 'value', 'meaning'), [
-        (f'`{name}`', f'`{value}`', meaning) for name, value, meaning in found])
-
-
 TABLES: dict[str, Callable[[], str]] = {
     'combinations': lambda: markdown(*combinations_of_laws.rows()),
     **{table.__name__: table for table in (
-        plant_facts, laws, printed_not_finite, printed_growth, disturbance, uncertain_plants,
-        estimator_constants)},
+        plant_facts, laws, printed_not_finite, printed_growth, uncertain_plants)},
 }
