@@ -17,6 +17,7 @@ from backlash_ros.core.estimation.search import search
 from backlash_ros.core.estimation.unmodelled import with_walk
 from backlash_ros.core.law import OutOfBounds
 from backlash_ros.core.parameters import Bounds
+from backlash_ros.core.plant.backlash import play
 from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.window import Window
 
@@ -146,9 +147,10 @@ def afresh(
 
 
 def mixed(p: Problem, best: WindowFit, others: Sequence[WindowFit] = ()) -> WindowFit:
-    """The likeliest of these fits and of others along the gap, with the spread of the mixture."""
+    """The likeliest of these fits, of others along the gap and of others that begin elsewhere in
+    the gap, with the spread of the mixture."""
     wider, beyond = _along_the_gap(p, best)
-    fits = [f for f in (best, *others, *beyond) if f.valid]
+    fits = [f for f in (best, *others, *beyond, *_begun_elsewhere(p, best)) if f.valid]
     alike_read = [f for f in fits if bool(f.step) == bool(best.step)]
     likeliest = max(alike_read, key=lambda f: f.evidence, default=best)
     if likeliest.evidence > best.evidence + 0.5:  # else it is the same optimum
@@ -163,6 +165,25 @@ def apart(one: WindowFit, other: WindowFit) -> Array:
     """Outer product (3 + K, 3 + K) of the differences between two fits in m, c_r, c_l, xi."""
     by = np.append(one.crossings - other.crossings, one.theta[3:] - other.theta[3:])
     return np.asarray(np.outer(by, by))
+
+
+def _begun_elsewhere(p: Problem, best: WindowFit) -> list[WindowFit]:
+    """Fits that begin where p is first moved in another stroke of v: there, p0 has another optimum.
+
+    None after many reversals, which leave a single one.
+    """
+    fits = list[WindowFit]()
+    if best.left.turns < settings.HELD_REVERSALS and isnan(p.older.v) and best.valid:
+        rises, v = np.diff(p.v, append=p.v[-1]) > 0.0, float(p.v[0])
+        stroke = np.cumsum(np.append(False, rises[1:] != rises[:-1]))
+        begins = [best.p0, *(v + best.gap * np.arange(5.0) / 4.0)]
+        first = [int(np.argmax(play(p.v, best.gap, p0) != p0)) for p0 in begins]
+        strokes, at = np.unique(stroke[np.maximum(np.subtract(first, 1), 0)], return_index=True)
+        with suppress(np.linalg.LinAlgError):
+            for p0 in (begins[i] for i in at if i):
+                held = p.step(replace(best, p0=p0), held=True, begun=True)
+                fits.append(p.finished(p.fitted(held, FIRST_STEPS)))
+    return fits
 
 
 def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]:
