@@ -116,10 +116,12 @@ def afresh(
         if not found or found[0].evidence < null + settings.ENGAGED:
             return None
         gaps = [f.gap for f in known]
-        for evidence, gap, p0, m in found:
-            near = evidence > found[0].evidence - settings.FAR_BEHIND and m * found[0].m > 0.0
-            if near and len(gaps) < candidates and \
-                    all(abs(gap - other) > 0.5 * max(gap, other) for other in gaps):
+        for evidence, gap, p0, m, peak in found:
+            # Around the wrong G, the evidence of another optimum may be far too low.
+            near = peak or evidence > found[0].evidence - settings.FAR_BEHIND
+            differs = 0.2 if peak else 0.5  # of a gap by at least so much; 0.16: next in the grid
+            if near and m * found[0].m > 0.0 and len(gaps) < candidates and \
+                    all(abs(gap - other) > differs * max(gap, other) for other in gaps):
                 gaps.append(gap)
                 theta = np.concatenate([[m, m * (p0 - first), gap], xi])
                 begin = WindowFit(np.zeros(1), p0, theta, noise, walk_std=setup.walk_std)
@@ -178,7 +180,7 @@ def _begun_elsewhere(p: Problem, best: WindowFit) -> list[WindowFit]:
         stroke = np.cumsum(np.append(False, rises[1:] != rises[:-1]))
         begins = [best.p0, *(v + best.gap * np.arange(5.0) / 4.0)]
         first = [int(np.argmax(play(p.v, best.gap, p0) != p0)) for p0 in begins]
-        strokes, at = np.unique(stroke[np.maximum(np.subtract(first, 1), 0)], return_index=True)
+        at = np.unique(stroke[np.maximum(np.subtract(first, 1), 0)], return_index=True)[1]
         with suppress(np.linalg.LinAlgError):
             for p0 in (begins[i] for i in at if i):
                 held = p.step(replace(best, p0=p0), held=True, begun=True)

@@ -18,12 +18,13 @@ from backlash_ros.core.plant.transfer_function import Array
 
 
 class Hypothesis(NamedTuple):
-    """A gap, p0 and the slope fitted with them, and their evidence."""
+    """A gap, p0 and the slope fitted with them, and their evidence; peak: a maximum over gaps."""
 
     evidence: float
     gap: float
     p0: float
     m: float
+    peak: bool = False
 
 
 def search(
@@ -98,7 +99,8 @@ def search(
     found = [h for part in parts for h in compared(part) if isfinite(h.evidence)]
     e = [-inf, *(h.evidence for h in found), -inf]
     peaks = sorted((h for k, h in enumerate(found) if e[k] < e[k + 1] > e[k + 2]), reverse=True)[:3]
-    return [*peaks, *sorted({*found} - {*peaks}, reverse=True)], float(value(y_rest @ y_rest))
+    rest_of_all = sorted({*found} - {*peaks}, reverse=True)
+    return [*(h._replace(peak=True) for h in peaks), *rest_of_all], float(value(y_rest @ y_rest))
 
 
 def _bins(v: Array) -> NDArray[np.intp]:

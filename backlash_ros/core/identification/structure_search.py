@@ -154,10 +154,10 @@ def _of_gaps(samples: Samples, like: Model) -> list[Model]:
     hypotheses, _ = search(structure, problem.v, y, 1e-12, 0.98 * float(np.ptp(problem.v)),
                            like.fit.theta[3:], smallest=smallest)
     begins, gaps = [like.fit], [like.gap]
-    for _, gap, p0, _ in hypotheses:
-        if len(begins) <= most and all(abs(gap - other) > ANOTHER * other for other in gaps):
-            gaps.append(gap)
-            begins.append(problem.step(like.begin(gap, p0), held=True))
+    for h in hypotheses:
+        if len(begins) <= most and all(abs(h.gap - other) > ANOTHER * other for other in gaps):
+            gaps.append(h.gap)
+            begins.append(problem.step(like.begin(h.gap, h.p0), held=True))
     some = sorted(fitted(samples, structure, begin, steps=FIRST_STEPS) for begin in begins)
     models: list[Model] = []
     for one in some:
