@@ -157,7 +157,12 @@ def mixed(p: Problem, best: WindowFit, others: Sequence[WindowFit] = ()) -> Wind
     likeliest = max(alike_read, key=lambda f: f.evidence, default=best)
     if likeliest.evidence > best.evidence + 0.5:  # else it is the same optimum
         return mixed(p, likeliest, fits)
-    share = np.exp([f.evidence - best.evidence for f in fits])
+    # A rival that explains the readings as well is not ruled out by what it leaves undetermined.
+    weights = p.at(best).weights
+    value = p.log_posterior(best, weights)
+    share = np.exp([max(f.evidence - best.evidence,
+                        p.log_posterior(f, weights) - value if f in alike_read else -inf)
+                    for f in fits])
     for each, f in zip(share / max(float(share.sum()), 1e-300), fits, strict=True):
         wider += each * apart(f, best)
     return replace(best, spread=wider)

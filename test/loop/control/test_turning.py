@@ -8,7 +8,7 @@ from strategies import GEAR, known_backlash
 
 from backlash_ros.core import Parameters, build_closed_loop
 from backlash_ros.core.assembly import build_model
-from backlash_ros.core.control.tracking.design import design
+from backlash_ros.core.control.tracking.design import design, variances
 from backlash_ros.core.control.tracking.feedback import TRUSTED_AFTER, StateFeedback, Trust
 from backlash_ros.core.control.tracking.tracking import Tracking
 from backlash_ros.core.control.tracking.trajectory import IdealTrajectory
@@ -154,7 +154,7 @@ def test_noise_of_the_references_asks_for_a_trajectory_that_it_moves_less() -> N
 def test_a_deviation_that_noise_explains_is_left_alone() -> None:
     feedback = StateFeedback(SLOW, 1.0, 1e-3)
     feedback.trust = Trust(held_for=TRUSTED_AFTER)
-    feedback.prepare(np.zeros((2, 2)), 1e-3, np.zeros((2, 2)), 0.0)
+    feedback.prepare(np.zeros((2, 2)), 1e-3, np.zeros(len(SLOW.schedule) + 1), 0.0)
     assert feedback.u([3e-3, 0.0], held_back=False, largest=1.0)[0] == 0.0
     full = SLOW.feedback.state[0]
     beyond = feedback.u([1e-2, 0.0], held_back=False, largest=1.0)[0]
@@ -164,7 +164,7 @@ def test_a_deviation_that_noise_explains_is_left_alone() -> None:
 def test_a_deviation_that_noise_of_the_references_explains_is_worth_no_crossing() -> None:
     feedback = StateFeedback(SLOW, 1.0, 1e-3)
     feedback.trust = Trust(held_for=TRUSTED_AFTER)
-    feedback.prepare(np.zeros((2, 2)), 1e-3, np.eye(2), 1e-2)
+    feedback.prepare(np.zeros((2, 2)), 1e-3, variances(SLOW.schedule, np.eye(2)), 1e-2)
     wanted, worth = feedback.u([1e-2, 0.0], held_back=False, largest=1.0)
     assert wanted > 0.0
     assert worth == 0.0

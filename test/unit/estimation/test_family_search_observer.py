@@ -59,6 +59,20 @@ def test_dead_time_and_another_frequency_are_among_them(omega_t: float, lag: flo
     assert min(abs(least_squares(apart, begin).fun).max() for begin in begins) < 1e-6
 
 
+@pytest.mark.parametrize('plant', PLANTS.values(), ids=PLANTS)
+def test_the_response_is_continuous_in_the_lag(plant: tuple[list[float], list[float]]) -> None:
+    family, by = PlantFamily(TransferFunction(*plant), 0.2), 1e-7
+    z = np.exp(1j * np.linspace(0.05, 3.0, 60))
+
+    def response(lag: float) -> np.ndarray:
+        xi = np.full(family.count, 0.4)
+        xi[family.leaks] = lag / family._scales[family.leaks][0]
+        return family.model_at(xi.tolist()).response(z)
+
+    for lag in np.arange(0.0, 2.5, 0.05):
+        np.testing.assert_allclose(response(lag + by), response(lag - by), rtol=1e-4)
+
+
 APART = 1e-3
 R = APART * np.arange(-12_000, 12_001)
 
