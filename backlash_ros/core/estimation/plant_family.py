@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from backlash_ros.core.plant.numerics import lfilter, multiplied, padded, shifted
 from backlash_ros.core.plant.transfer_function import ON_CIRCLE, Array, TransferFunction, memory_of
 
-# While f is between 1 - 2 EARLY and 1 - EARLY, the width passes to the next sample: so G is
-# continuous in the lag, and smooth where this is a whole number of samples, as it usually is.
-EARLY = 0.1
+# G jumps where i changes: that is so far below a whole number of samples, which is the most usual
+# lag, and leaves less than 0.003 of a dead time unexplained.
+EARLY = 0.05
 
 
 class Family(Protocol):
@@ -75,10 +75,10 @@ class PlantFamily:
         self.count, self.leaks = len(self._scales), int(self.integrates and uncertainty > 0.0)
         shorter = np.poly1d([1.0, 1.0]) ** max(len(b) - 2, 0)
         wide = np.convolve(shorter * (b.sum() / shorter(1.0)), [1.0, -2.0, 1.0])
-        # B, and its derivative by width: as they are, and a sample later.
+        # B, and its derivatives by lag and width.
         self._taps: list[list[float]] = [
-            padded(np.append(np.zeros(late), taps), max(len(b) + 2, 4)).tolist()
-            for taps in (b, wide) for late in (0, 1)]
+            padded(taps, max(len(b) + 1, 3)).tolist()
+            for taps in (b, np.append(0.0, b) - np.append(b, 0.0), wide)]
 
     def at(self, xi: list[float]) -> tuple[list[float], list[float]]:
         b, a = self._coefficients(xi)
@@ -101,14 +101,11 @@ class PlantFamily:
         integrator = [1.0, -1.0 + (moved.pop(0) if self.leaks else 0.0)] * self.integrates
         lag, width, *logs = moved
         stable = self._stable([x + y for x, y in zip(self._nominal, logs, strict=True)])
-        whole = max(floor(lag.real), 1 - self._delay)
+        whole = max(floor(lag.real + EARLY), 1 - self._delay)
         gain = sum(stable) / self._gain
-        f = lag - whole
-        later = (f - 1.0) / EARLY + 2.0  # share of the width that acts a sample later
-        later = later if 0.0 < later.real < 1.0 else complex(later.real > 0.0)
         b = [0j] * (self._delay + whole - 1) + [
-            gain * (x + f * (late - x) + width * (wide + later * (wider - wide)))
-            for x, late, wide, wider in zip(*self._taps, strict=True)][:None if later else -1]
+            gain * (x + (lag - whole) * move + width * wide)
+            for x, move, wide in zip(*self._taps, strict=True)]
         a = multiplied(stable, self._rest, integrator or [1.0])
         while not self.count and not b[-1]:  # trim, unless the length must be the same at all xi
             b.pop()
