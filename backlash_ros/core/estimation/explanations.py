@@ -160,10 +160,11 @@ def mixed(p: Problem, best: WindowFit, others: Sequence[WindowFit] = ()) -> Wind
     # A rival that explains the readings as well is not ruled out by what it leaves undetermined.
     weights = p.at(best).weights
     value = p.log_posterior(best, weights)
-    share = np.exp([max(f.evidence - best.evidence,
-                        p.log_posterior(f, weights) - value if f in alike_read else -inf)
-                    for f in fits])
-    for each, f in zip(share / max(float(share.sum()), 1e-300), fits, strict=True):
+    odds = np.array([max(f.evidence - best.evidence,
+                         p.log_posterior(f, weights) - value if f in alike_read else -inf)
+                     for f in fits])
+    share = np.exp(odds - odds.max(initial=-inf))
+    for each, f in zip(share / share.sum(), fits, strict=True):
         wider += each * apart(f, best)
     return replace(best, spread=wider)
 
