@@ -149,8 +149,7 @@ def afresh(
 
 
 def mixed(p: Problem, best: WindowFit, others: Sequence[WindowFit] = ()) -> WindowFit:
-    """The likeliest of these fits, of others along the gap and of others that begin elsewhere in
-    the gap, with the spread of the mixture."""
+    """The likeliest of these fits and of others nearby, with the spread of the mixture."""
     wider, beyond = _along_the_gap(p, best)
     fits = [f for f in (best, *others, *beyond, *_begun_elsewhere(p, best)) if f.valid]
     alike_read = [f for f in fits if bool(f.step) == bool(best.step)]
@@ -176,21 +175,17 @@ def apart(one: WindowFit, other: WindowFit) -> Array:
 
 
 def _begun_elsewhere(p: Problem, best: WindowFit) -> list[WindowFit]:
-    """Fits that begin where p is first moved in another stroke of v: there, p0 has another optimum.
-
-    None after many reversals, which leave a single one.
-    """
+    """Fits in which another stroke of v is the first to move p: there, p0 has another optimum."""
     fits = list[WindowFit]()
-    if best.left.turns < settings.HELD_REVERSALS and isnan(p.older.v) and best.valid:
-        rises, v = np.diff(p.v, append=p.v[-1]) > 0.0, float(p.v[0])
-        stroke = np.cumsum(np.append(False, rises[1:] != rises[:-1]))
-        begins = [best.p0, *(v + best.gap * np.arange(5.0) / 4.0)]
-        first = [int(np.argmax(play(p.v, best.gap, p0) != p0)) for p0 in begins]
-        at = np.unique(stroke[np.maximum(np.subtract(first, 1), 0)], return_index=True)[1]
-        with suppress(np.linalg.LinAlgError):
-            for p0 in (begins[i] for i in at if i):
-                held = p.step(replace(best, p0=p0), held=True, begun=True)
-                fits.append(p.finished(p.fitted(held, FIRST_STEPS)))
+    if best.left.turns >= settings.HELD_REVERSALS or not isnan(p.older.v) or not best.valid:
+        return fits  # many reversals leave a single one
+    rises, begins = np.diff(p.v) > 0.0, [best.p0, *(p.v[0] + best.gap * np.arange(5.0) / 4.0)]
+    stroke = np.cumsum(np.append([0, 0], rises[1:] != rises[:-1]))
+    first = [stroke[np.argmax(play(p.v, best.gap, p0) != p0)] for p0 in begins]
+    with suppress(np.linalg.LinAlgError):
+        for p0 in (float(begins[i]) for i in np.unique(first, return_index=True)[1] if i):
+            held = p.step(replace(best, p0=p0), held=True, begun=True)
+            fits.append(p.finished(p.fitted(held, FIRST_STEPS)))
     return fits
 
 

@@ -19,7 +19,7 @@ from backlash_ros.core.estimation import posterior
 from backlash_ros.core.estimation.plant_family import Family, sensitivities
 from backlash_ros.core.estimation.posterior import Prior, WindowFit
 from backlash_ros.core.plant.backlash import Region, engaged, play, reversals
-from backlash_ros.core.plant.numerics import lfilter, padded, shifted, step_of
+from backlash_ros.core.plant.numerics import lfilter, padded, shifted, step_of, triangle
 from backlash_ros.core.plant.transfer_function import Array
 
 STEPS, FIRST_STEPS, FEW_STEPS = 16, 6, 3  # limits on the number of Gauss-Newton steps
@@ -121,7 +121,7 @@ class Problem:
         """
         from scipy.linalg.lapack import dtrtri  # late: 31 MB that only fits need
 
-        r, run = _triangle(self.rows(f, held, begun)), self.at(f)
+        r, run = triangle(self.rows(f, held, begun)), self.at(f)
         if not np.isfinite(r).all():
             raise np.linalg.LinAlgError('the samples leave no finite posterior')
         # eta, all unknowns but the error of G, is R11^-1 (d1 - R12 xi) + R11^-1 noise.
@@ -154,7 +154,7 @@ class Problem:
         number[self.known] = self.at(f).number
         told = ~np.isin(number[:count], number[count:])  # else the rest of the record tells it, too
         rows = self.rows(f)
-        r = _triangle(np.vstack([rows[:count][told], rows[len(self.v):]]))
+        r = triangle(np.vstack([rows[:count][told], rows[len(self.v):]]))
         at = len(r) - 4 - self.family.count
         return Prior(r[at:-1, at:-1], r[at:-1, -1])
 
@@ -326,9 +326,3 @@ class Problem:
         if best.left.rms < 1.5 * max(f.noise, step / sqrt(12.0)):
             return best
         return self.finished(self.fitted(f.without_intervals))
-
-
-def _triangle(rows: Array) -> Array:
-    from scipy.linalg.lapack import dgeqrf  # late: 31 MB that only fits need
-
-    return np.asarray(np.triu(dgeqrf(rows, overwrite_a=1)[0][:rows.shape[1]]))

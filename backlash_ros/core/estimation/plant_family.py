@@ -16,7 +16,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.plant.numerics import lfilter, multiplied, padded, shifted
+from backlash_ros.core.plant.numerics import multiplied, padded, shifted
 from backlash_ros.core.plant.transfer_function import ON_CIRCLE, Array, TransferFunction, memory_of
 
 # G jumps where i changes: that is so far below a whole number of samples, which is the most usual
@@ -132,11 +132,6 @@ class PlantFamily:
         powers = 1.0 / z[:, None] ** np.arange(db.shape[1])
         of_b, of_a = (powers[:, :len(x)] @ np.array(x) for x in self.at(xi))
         return np.asarray(powers @ db.T / of_b[:, None] - powers @ da.T / of_a[:, None])
-
-
-def state_columns(a: list[float], count: int) -> Array:
-    """Responses of y to each element of the state X before the record, shape (count, order)."""
-    return shifted(lfilter([1.0], a, np.eye(1, count)[0]), len(a) - 1).T
 
 
 def sensitivities(family: Family, xi: list[float], u: Array, y: Array) -> Array:

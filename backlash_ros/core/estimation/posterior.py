@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.settings import CHANCE
+from backlash_ros.core.plant.numerics import squares_of
 from backlash_ros.core.plant.transfer_function import Array
 
 SCALES = np.asarray(np.geomspace(3e-4, 10.0, 14), np.float64)  # grid of s
@@ -222,16 +223,6 @@ def agree(one: Array, other: Array, cov: Array) -> bool:
     from scipy.special import chdtri  # late: 31 MB that only fits need
 
     return squares_of(one - other, cov) < float(chdtri(len(one), CHANCE))
-
-
-def squares_of(apart: Array, cov: Array) -> float:
-    """Square of a difference (n,) in standard deviations of its covariance (n, n)."""
-    return float(apart @ np.linalg.lstsq(cov, apart, rcond=1e-14)[0])
-
-
-def log_density(apart: Array, cov: Array) -> float:
-    """Log-density of a difference (n,) of this covariance (n, n), up to a constant."""
-    return -0.5 * (squares_of(apart, cov) + float(np.linalg.slogdet(cov)[1]))
 
 
 def error_of_plant(

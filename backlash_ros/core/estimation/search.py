@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.plant_family import Family, sensitivities, state_columns
+from backlash_ros.core.estimation.plant_family import Family, sensitivities
 from backlash_ros.core.estimation.settings import ROWS
 from backlash_ros.core.plant.backlash import play
-from backlash_ros.core.plant.numerics import lfilter
+from backlash_ros.core.plant.numerics import lfilter, shifted
 from backlash_ros.core.plant.transfer_function import Array
 
 
@@ -44,7 +44,8 @@ def search(
         """Columns (..., N) summed over bins, each divided by the root of its number of readings."""
         return np.asarray(np.add.reduceat(columns * known, begins, axis=-1) * weights)
 
-    common = np.vstack([state_columns(a, len(v)).T, lfilter(b, a, np.ones(len(v)))])
+    of_state = shifted(lfilter([1.0], a, np.eye(1, len(v))[0]), len(a) - 1)
+    common = np.vstack([of_state, lfilter(b, a, np.ones(len(v)))])
     q = np.linalg.qr(averaged(common).T)[0]
     freedom = max(q.shape[0] - q.shape[1], 1)
 

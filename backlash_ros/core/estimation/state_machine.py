@@ -26,7 +26,7 @@ from backlash_ros.core.estimation.late_commands import likelier, weighed
 from backlash_ros.core.estimation.posterior import Prior, WindowFit, agree
 from backlash_ros.core.estimation.settings import BLOCKS, FEWEST, MISFIT, PREDICTED, SHORT_RECORD
 from backlash_ros.core.estimation.unmodelled import coasts, with_walk
-from backlash_ros.core.plant.numerics import isolated
+from backlash_ros.core.plant.numerics import isolated, log_density, squares_of
 from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.window import Window
 
@@ -315,9 +315,9 @@ def _beside_inherited(setup: Setup, belief: Belief, fit: WindowFit, known: Known
             belief = belief._replace(inherited=None)  # it belonged to another plant
         return belief._replace(reason=Status.INCONSISTENT)
     # Samples that tell little contradict nothing: they must speak for it, against another plant.
-    odds = posterior.log_density(apart, alike) - posterior.log_density(apart, another)
+    odds = log_density(apart, alike) - log_density(apart, another)
     # Where both are further apart than their deviations, these were too small (R. T. Birge).
-    widened = prior * max(posterior.squares_of(apart, alike) / len(apart), 1.0)
+    widened = prior * max(squares_of(apart, alike) / len(apart), 1.0)
     gain = prior @ np.linalg.pinv(alike)
     joined = Known(known.crossings + gain @ apart, widened - gain @ widened)
     if belief.coasts or (not compatible and fit.systematic):

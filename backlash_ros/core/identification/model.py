@@ -19,7 +19,6 @@ from numpy.polynomial.polynomial import polyval
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.fit import STEPS, Problem
-from backlash_ros.core.estimation.plant_family import state_columns
 from backlash_ros.core.estimation.posterior import Prior, WindowFit
 from backlash_ros.core.judgement.deviations import covariance_of, effective
 from backlash_ros.core.plant.backlash import play
@@ -188,7 +187,7 @@ def first_model(samples: Samples, structure: Structure, gap: float, p0: float) -
         # Only the free poles multiply y; an integrator divides all that y follows.
         whole = np.asarray(np.convolve(a, (1.0, -1.0))) if structure.integrator else a
         moved, constant = lfilter([1.0], whole, moves)
-        of_state = state_columns(padded(whole, structure.states + 1).tolist(), count).T
+        of_state = shifted(lfilter([1.0], whole, np.eye(1, count)[0]), structure.states)
         return np.vstack([shifted(moved, taps), constant, of_state])
 
     y, found = np.interp(np.arange(count), np.flatnonzero(known), problem.y[known]), []
