@@ -133,10 +133,9 @@ def afresh(
         if best.valid and best.behind(xi) < 1.0:
             break
         xi = best.theta[3:]
-    different: list[WindowFit] = []
-    for f in sorted((f for f in fits if np.isfinite(f.evidence)), key=lambda f: -f.evidence):
-        if all(abs(f.gap - g.gap) >= 0.1 * sqrt(max(float(g.cov[2, 2]), 0.0)) for g in different):
-            different.append(f)
+    fits = sorted((f for f in fits if np.isfinite(f.evidence)), key=lambda f: -f.evidence)
+    different = [f for i, f in enumerate(fits) if all(
+        abs(f.gap - g.gap) >= 0.1 * sqrt(max(float(g.cov[2, 2]), 0.0)) for g in fits[:i])]
     if not different:
         return None
     likely = different[0].evidence - settings.FAR_BEHIND
@@ -157,11 +156,10 @@ def mixed(p: Problem, best: WindowFit, others: Sequence[WindowFit] = ()) -> Wind
     if likeliest.evidence > best.evidence + 0.5:  # else it is the same optimum
         return mixed(p, likeliest, fits)
     # A rival that explains the readings as well is not ruled out by what it leaves undetermined.
-    weights = p.at(best).weights
-    value = p.log_posterior(best, weights)
+    w = p.at(best).weights
     odds = np.array([max(f.evidence - best.evidence,
-                         p.log_posterior(f, weights) - value if f in alike_read else -inf)
-                     for f in fits])
+                         p.log_posterior(f, w) - p.log_posterior(best, w)
+                         if f in alike_read else -inf) for f in fits])
     share = np.exp(odds - odds.max(initial=-inf))
     for each, f in zip(share / share.sum(), fits, strict=True):
         wider += each * apart(f, best)

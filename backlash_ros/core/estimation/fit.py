@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimation import posterior
-from backlash_ros.core.estimation.plant_family import Family, sensitivities
+from backlash_ros.core.estimation.plant_family import sensitivities
 from backlash_ros.core.estimation.posterior import Prior, WindowFit
 from backlash_ros.core.plant.backlash import Region, engaged, play, reversals
 from backlash_ros.core.plant.numerics import lfilter, padded, shifted, step_of, triangle
-from backlash_ros.core.plant.transfer_function import Array
+from backlash_ros.core.plant.transfer_function import Array, Family
 
 STEPS, FIRST_STEPS, FEW_STEPS = 16, 6, 3  # limits on the number of Gauss-Newton steps
 

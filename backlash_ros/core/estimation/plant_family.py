@@ -11,34 +11,22 @@ pole left over. Poles at 0, on the negative axis or outside the unit circle are 
 from cmath import cos, exp, sqrt
 from collections.abc import Sequence
 from math import copysign, floor, inf
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.plant.numerics import multiplied, padded, shifted
-from backlash_ros.core.plant.transfer_function import ON_CIRCLE, Array, TransferFunction, memory_of
+from backlash_ros.core.plant.transfer_function import (
+    ON_CIRCLE,
+    Array,
+    Family,
+    TransferFunction,
+    memory_of,
+)
 
 # G jumps where i changes: that is so far below a whole number of samples, which is the most usual
 # lag, and leaves less than 0.003 of a dead time unexplained.
 EARLY = 0.05
-
-
-class Family(Protocol):
-    """Plants b / a to be fitted, with K = count unknown parameters xi."""
-
-    @property
-    def count(self) -> int: ...
-
-    @property
-    def leaks(self) -> int:
-        """Number of first xi with a fixed prior N(0, 1); the others share the unknown scale s."""
-
-    def at(self, xi: list[float]) -> tuple[list[float], list[float]]:
-        """b, a of y(k) = sum b_i u(k-i) - sum a_i y(k-i), equally long; u(k) acts before y(k)."""
-
-    def slopes(self, xi: list[float]) -> tuple[Array, Array]:
-        """Derivatives of b and of a by each xi, both of shape (K, n + 1)."""
 
 
 class PlantFamily:

@@ -10,11 +10,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.plant_family import Family, sensitivities
+from backlash_ros.core.estimation.plant_family import sensitivities
 from backlash_ros.core.estimation.settings import ROWS
 from backlash_ros.core.plant.backlash import play
 from backlash_ros.core.plant.numerics import lfilter, shifted
-from backlash_ros.core.plant.transfer_function import Array
+from backlash_ros.core.plant.transfer_function import Array, Family
 
 
 class Hypothesis(NamedTuple):

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,6 +79,23 @@ class TransferFunction:
         for i, (a, b) in enumerate(self._terms):
             x[i] = (x[i + 1] if i < last else 0.0) + a * y + b * u
         return x[0]
+
+
+class Family(Protocol):
+    """Plants b / a to be fitted, with K = count unknown parameters xi."""
+
+    @property
+    def count(self) -> int: ...
+
+    @property
+    def leaks(self) -> int:
+        """Number of first xi with a fixed prior N(0, 1); the others share the unknown scale s."""
+
+    def at(self, xi: list[float]) -> tuple[list[float], list[float]]:
+        """b, a of y(k) = sum b_i u(k-i) - sum a_i y(k-i), equally long; u(k) acts before y(k)."""
+
+    def slopes(self, xi: list[float]) -> tuple[Array, Array]:
+        """Derivatives of b and of a by each xi, both of shape (K, n + 1)."""
 
 
 class StateModel:
