@@ -212,6 +212,13 @@ def test_saved_estimates_of_another_plant_are_never_said_to_track(seed: int) -> 
     assert Sequence(seed).run()['wrong_inherited'] == []
 
 
+# A G that jumps where its lag does, and two plays that explain y as well as each other.
+@pytest.mark.parametrize('seed', [2009, 2207])
+@pytest.mark.filterwarnings('ignore')
+def test_one_of_two_explanations_is_not_said_to_track(seed: int) -> None:
+    assert Sequence(seed).run()['wrong'] == []
+
+
 PERIOD_NS = 10_000_000
 MOVE = 0.5  # at most, from sample to sample
 
