@@ -139,7 +139,7 @@ def test_a_bound_that_keeps_a_good_estimate_back_is_named_with_what_was_found(na
 @pytest.mark.parametrize(('what', 'more'), [
     ('sine 0.5 rad/s; G known', {}), ('sine 0.2 rad/s; exact', {}),
     ('triangle 1.2 rad/s, swing 1.5', {}), ('moves 18 rad/s, swing 1.4', {}),
-    ('square 6.5 rad/s, swing 20', {}),
+    ('square 6.5 rad/s, swing 20; extra_lag 0.0088', {}),
     ('square 5.1 rad/s, swing 2.6', {'structure': 'tracking'}),
 ])
 def test_a_usual_motion_is_never_tracked_wrongly_and_blames_nothing(what, more):

@@ -8,10 +8,11 @@ from scipy.signal import cont2discrete
 from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR
 
 from backlash_ros.core.estimation.explanations import Setup, afresh
+from backlash_ros.core.estimation.fit import Problem
 from backlash_ros.core.estimation.late_commands import weighed
 from backlash_ros.core.estimation.observer import RATIOS
 from backlash_ros.core.estimation.plant_family import PlantFamily
-from backlash_ros.core.estimation.posterior import independence, likelihood
+from backlash_ros.core.estimation.posterior import WindowFit, independence, likelihood
 from backlash_ros.core.estimation.search import search
 from backlash_ros.core.parameters import Bounds, Parameters
 from backlash_ros.core.plant.backlash import play
@@ -89,6 +90,19 @@ def test_density_slope_and_information_belong_together(noise: float, step: float
     assert found.score[near] == pytest.approx(by_output[near], abs=1e-3)
     curvature = np.gradient(found.score, R)[near].sum()
     assert found.information[near].sum() == pytest.approx(curvature, rel=1e-3)
+
+
+@pytest.mark.parametrize(('period', 'told'), [(60, False), (61.8, True)])
+def test_dropped_readings_whose_rounding_is_repeated_say_nothing(period: float, told: bool) -> None:
+    v = 3.0 * np.sin(2.0 * np.pi * np.arange(240) / period)
+    family = PlantFamily(TransferFunction([0.3], [1.0, -0.7]), 0.0)
+    b, a = family.at([])
+    y = 0.05 * np.round(lfilter(b, a, play(v, 1.0, 0.5) - 0.5) / 0.05)
+    problem = Problem(family, v, y, 1e-3)
+    begin = WindowFit(np.zeros(1), 0.5, np.array([1.0, 0.5, 1.0]), 1e-3)
+    fit = problem.with_intervals(problem.fitted(begin))
+    of_gap = float(problem.remembered(fit, 120).rows[2, 2])
+    assert (abs(of_gap) > 10.0) is told
 
 
 def test_readings_that_repeat_one_rounding_count_as_one() -> None:
