@@ -26,7 +26,7 @@ from backlash_ros.core.plant.transfer_function import (
 
 # G jumps where i changes: that is so far below a whole number of samples, which is the most usual
 # lag, and leaves less than 0.003 of a dead time unexplained.
-EARLY = 0.05
+BEFORE_WHOLE = 0.05
 
 
 class PlantFamily:
@@ -89,7 +89,7 @@ class PlantFamily:
         integrator = [1.0, -1.0 + (moved.pop(0) if self.leaks else 0.0)] * self.integrates
         lag, width, *logs = moved
         stable = self._stable([x + y for x, y in zip(self._nominal, logs, strict=True)])
-        whole = max(floor(lag.real + EARLY), 1 - self._delay)
+        whole = max(floor(lag.real + BEFORE_WHOLE), 1 - self._delay)
         gain = sum(stable) / self._gain
         b = [0j] * (self._delay + whole - 1) + [
             gain * (x + (lag - whole) * move + width * wide)
