@@ -157,8 +157,8 @@ def mixed(p: Problem, best: WindowFit, others: Sequence[WindowFit] = ()) -> Wind
         return mixed(p, likeliest, fits)
     # A rival that explains the readings as well is not ruled out by what it leaves undetermined.
     w = p.at(best).weights
-    odds = np.array([max(f.evidence - best.evidence,
-                         p.log_posterior(f, w) - p.log_posterior(best, w)
+    value = p.log_posterior(best, w)
+    odds = np.array([max(f.evidence - best.evidence, p.log_posterior(f, w) - value
                          if f in alike_read else -inf) for f in fits])
     share = np.exp(odds - odds.max(initial=-inf))
     for each, f in zip(share / share.sum(), fits, strict=True):

@@ -24,8 +24,8 @@ from backlash_ros.core.plant.transfer_function import (
     memory_of,
 )
 
-# G jumps where i changes: that is so far below a whole number of samples, which is the most usual
-# lag, and leaves less than 0.003 of a dead time unexplained.
+# G jumps where i changes: so far below a whole number of samples, which is the most usual lag. This
+# leaves at most a hundredth of a dead time unexplained.
 BEFORE_WHOLE = 0.05
 
 

@@ -48,8 +48,11 @@ def test_slopes_are_those_of_the_coefficients(plant: tuple[list[float], list[flo
 
 
 @pytest.mark.parametrize('omega_t', [0.13, 1.0, 2.5])
-@pytest.mark.parametrize('lag', [0.0, 0.3, 1.0, 2.6])
-def test_dead_time_and_another_frequency_are_among_them(omega_t: float, lag: float) -> None:
+@pytest.mark.parametrize(
+    ('lag', 'most'), [(0.0, 1e-6), (0.3, 1e-6), (1.0, 1e-6), (2.6, 1e-6), (0.96, 1e-2)])
+def test_dead_time_and_another_frequency_are_among_them(
+    omega_t: float, lag: float, most: float,
+) -> None:
     family = PlantFamily(two_poles(omega_t), 0.2)
     true = altered_plant(two_poles(omega_t), 0.9, 1.0, lag)
     z = np.exp(1j * np.linspace(0.05, 3.0, 60))
@@ -57,7 +60,7 @@ def test_dead_time_and_another_frequency_are_among_them(omega_t: float, lag: flo
         off = family.model_at(xi.tolist()).response(z) - true.response(z)
         return np.concatenate([off.real, off.imag])
     begins = [[(lag + by) / family._scales[0][0], 0.0, 0.0, 0.0] for by in (-0.2, 0.1, 0.2)]
-    assert min(abs(least_squares(apart, begin).fun).max() for begin in begins) < 1e-6
+    assert min(abs(least_squares(apart, begin).fun).max() for begin in begins) < most
 
 
 @pytest.mark.parametrize('plant', PLANTS.values(), ids=PLANTS)
