@@ -12,7 +12,7 @@
 |           |                            |                      | enough                          |
 """
 
-from math import isnan
+from math import isnan, log
 
 import numpy as np
 from numpy.typing import NDArray
@@ -295,7 +295,6 @@ def _published(setup: Setup, belief: Belief, fit: WindowFit) -> Belief:
 def _beside_inherited(setup: Setup, belief: Belief, fit: WindowFit, known: Known) -> Belief:
     # Unexplained motion may be gap as well, and the lost motion of a gear varies with its motion.
     replacing = 0.05  # std of the gap over the gap below which samples replace what was known
-    confirming = 2.3  # log odds, against those of another plant, at which samples confirm it
     doubt = (fit.unexplained * fit.gap) ** 2 / 2.0
     cov = fit.crossings_cov + doubt * np.diag([0.0, 1.0, 1.0])
     (m, c_r, c_l), apart = known.crossings, fit.crossings - known.crossings
@@ -322,7 +321,7 @@ def _beside_inherited(setup: Setup, belief: Belief, fit: WindowFit, known: Known
     joined = Known(known.crossings + gain @ apart, widened - gain @ widened)
     if belief.coasts or (not compatible and fit.systematic):
         joined = known  # a fit that leaves motion unexplained must not move it
-    if odds < confirming or not setup.are_precise(*joined, fit.systematic):
+    if odds < -log(settings.CHANCE) or not setup.are_precise(*joined, fit.systematic):
         return belief._replace(reason=Status.ACQUIRING)
     reason = Status.INCONSISTENT if setup.moves_unexplained(fit) else Status.TRACKING
     return belief._replace(published=joined, reason=reason)
