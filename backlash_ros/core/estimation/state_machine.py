@@ -305,9 +305,10 @@ def _beside_inherited(setup: Setup, belief: Belief, fit: WindowFit, known: Known
         prior = prior + settings.LOST_MOTION**2 * np.diag(size**2 / [4.0, 2.0, 2.0])
     alike, another = cov + prior, cov + prior + np.diag(size**2)
     if not agree(fit.crossings, known.crossings, alike):
-        # A gear that is not pure play leaves systematic residuals, or takes G to its limits, which
-        # refutes nothing.
-        white = not fit.systematic and fit.scale < posterior.SCALES[-1]
+        # A gear that is not pure play leaves systematic residuals, or takes G beyond all that its
+        # prior allows, which refutes nothing.
+        white = not fit.systematic and \
+            max(map(abs, fit.xi), default=0.0) < settings.BY_CHANCE * posterior.SCALES[-1]
         sure = white and fit.left.turns >= settings.HELD_REVERSALS and \
             posterior.gap_variance(cov) < (replacing * fit.gap) ** 2
         if sure and belief.trial.predicted >= belief.trial.must:

@@ -33,7 +33,7 @@ def test_identified_from_limits_alone_the_loop_removes_what_backlash_does(identi
     assert run.said_tracking_off_by(lost) < 0.05
 
 
-def test_a_fit_that_takes_g_to_its_limits_does_not_replace_what_was_identified():
+def test_a_fit_that_takes_g_far_from_its_prior_does_not_replace_what_was_identified():
     runs = run_gears('cnc')
     assert all(run.usable for run in runs)
     assert not any(run.wrong for run in runs)
