@@ -131,7 +131,8 @@ def main() -> int:
         tables[name], further = part.measure(arguments.duration)
         checks += further
         # Shown as soon as it is known: all of them take minutes.
-        print(f'\n{part.title}\n{format_table(part.header, tables[name])}', flush=True)
+        rows = tables[name] or [check.row for check in further]
+        print(f'\n{part.title}\n{format_table(part.header, rows)}', flush=True)
     if checks:
         print('\n' + format_table(CHECK_HEADER, [check.row for check in checks]))
     if arguments.write:
