@@ -16,10 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimation import posterior
-from backlash_ros.core.estimation.plant_family import sensitivities
 from backlash_ros.core.estimation.posterior import Prior, WindowFit
 from backlash_ros.core.plant.backlash import Region, engaged, play, reversals
-from backlash_ros.core.plant.numerics import lfilter, padded, shifted, step_of, triangle
+from backlash_ros.core.plant.numerics import (
+    lfilter,
+    padded,
+    sensitivities,
+    shifted,
+    step_of,
+    triangle,
+)
 from backlash_ros.core.plant.transfer_function import Array, Family
 
 STEPS, FIRST_STEPS, FEW_STEPS = 16, 6, 3  # limits on the number of Gauss-Newton steps
@@ -285,8 +291,9 @@ class Problem:
         value = float(w @ density) + count * log(self.step_of_readings or self.nominal)
         turns = len(reversals(engaged(self.v, run.p, max(f.gap, 0.0))))
         rms = sqrt(float(run.error @ run.error) / max(int(known.sum()), 1))
+        gain = max(float(np.std(run.y)), 1e-300) / max(float(np.std(run.u)), 1e-300)
         return replace(f, left=posterior.Left(
-            value, rms, rho, dispersion if f.step else 1.0, count, turns))
+            value, rms, rho, dispersion if f.step else 1.0, count, turns, gain))
 
     def begun(self, f: WindowFit, offset: bool = False) -> WindowFit:
         """This fit with X, and o too if `offset`, from linear least squares; all else is held."""

@@ -15,14 +15,8 @@ from math import copysign, floor, inf
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.plant.numerics import multiplied, padded, shifted
-from backlash_ros.core.plant.transfer_function import (
-    ON_CIRCLE,
-    Array,
-    Family,
-    TransferFunction,
-    memory_of,
-)
+from backlash_ros.core.plant.numerics import multiplied, padded
+from backlash_ros.core.plant.transfer_function import ON_CIRCLE, Array, TransferFunction, memory_of
 
 # G jumps where i changes: so far below a whole number of samples, which is the most usual lag. This
 # leaves at most a hundredth of a dead time unexplained.
@@ -120,13 +114,6 @@ class PlantFamily:
         powers = 1.0 / z[:, None] ** np.arange(db.shape[1])
         of_b, of_a = (powers[:, :len(x)] @ np.array(x) for x in self.at(xi))
         return np.asarray(powers @ db.T / of_b[:, None] - powers @ da.T / of_a[:, None])
-
-
-def sensitivities(family: Family, xi: list[float], u: Array, y: Array) -> Array:
-    """Derivatives of y by each xi, (..., K, N); u, y: input and output filtered by 1/A."""
-    of_b, of_a = family.slopes(xi)
-    taps = of_b.shape[1]
-    return np.asarray(of_b @ shifted(u, taps) - of_a @ shifted(y, taps))
 
 
 def _sections(poles: NDArray[np.complex128]) -> tuple[int, list[float]]:

@@ -100,6 +100,7 @@ class Left(NamedTuple):
     dispersion: float = 1.0  # mean square of the scores of intervals, over their information
     readings: float = 0.0  # number of independent readings
     turns: int = 0  # reversals of the play
+    gain: float = 1.0  # of G for this motion: standard deviation of y over that of u
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,8 +193,8 @@ class WindowFit:
 
     @property
     def unexplained(self) -> float:
-        """RMS of the correlated part of the residuals, over m times the gap."""
-        moves = sqrt(self.left.correlation) * self.left.rms
+        """RMS of the correlated part of the residuals, as motion of u over m times the gap."""
+        moves = sqrt(self.left.correlation) * self.left.rms / self.left.gain
         return moves / (abs(self.m) * max(self.gap, 1e-12))
 
     @property

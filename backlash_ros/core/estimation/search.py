@@ -10,10 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.plant_family import sensitivities
 from backlash_ros.core.estimation.settings import ROWS
 from backlash_ros.core.plant.backlash import play
-from backlash_ros.core.plant.numerics import lfilter, shifted
+from backlash_ros.core.plant.numerics import lfilter, sensitivities, shifted
 from backlash_ros.core.plant.transfer_function import Array, Family
 
 

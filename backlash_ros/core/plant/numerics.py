@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from backlash_ros.core.parameters import ParameterError
-from backlash_ros.core.plant.transfer_function import Array, StateModel, TransferFunction
+from backlash_ros.core.plant.transfer_function import Array, Family, StateModel, TransferFunction
 
 
 def lfilter(
@@ -59,6 +59,13 @@ def shifted(x: Array, count: int) -> Array:
     for late in range(min(count, x.shape[-1])):
         out[..., late, late:] = x[..., :x.shape[-1] - late]
     return out
+
+
+def sensitivities(family: Family, xi: list[float], u: Array, y: Array) -> Array:
+    """Derivatives of y by each xi, (..., K, N); u, y: input and output filtered by 1/A."""
+    of_b, of_a = family.slopes(xi)
+    taps = of_b.shape[1]
+    return np.asarray(of_b @ shifted(u, taps) - of_a @ shifted(y, taps))
 
 
 def multiplied(*factors: Sequence[complex]) -> list[complex]:

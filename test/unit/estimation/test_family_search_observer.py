@@ -108,6 +108,19 @@ def test_dropped_readings_whose_rounding_is_repeated_say_nothing(period: float, 
     assert (abs(of_gap) > 10.0) is told
 
 
+def test_what_is_unexplained_does_not_depend_on_the_unit_of_y() -> None:
+    v = 3.0 * np.sin(2.0 * np.pi * np.arange(400) / 61.8)
+    found = []
+    for unit in (1.0, 1e4):
+        family = PlantFamily(TransferFunction([0.3 * unit], [1.0, -0.7]), 0.0)
+        y = lfilter([0.3 * unit], [1.0, -0.7], play(v, 1.0, 0.5) - 0.5 + 0.02 * np.sin(1.7 * v))
+        problem = Problem(family, v, y, 1e-3 * unit)
+        begin = WindowFit(np.zeros(1), 0.5, np.array([1.0, 0.5, 1.0]), 1e-3 * unit)
+        found.append(problem.finished(problem.fitted(begin)).unexplained)
+    assert found[1] == pytest.approx(found[0], rel=1e-6)
+    assert 1e-3 < found[0] < 0.1
+
+
 def test_readings_that_repeat_one_rounding_count_as_one() -> None:
     y, known = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 9.0]), np.arange(6) < 5
     weights, number = independence(y, known, np.full(6, 1.2), 1.0)
