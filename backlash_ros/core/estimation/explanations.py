@@ -177,11 +177,13 @@ def _begun_elsewhere(p: Problem, best: WindowFit) -> list[WindowFit]:
     fits = list[WindowFit]()
     if best.left.turns >= settings.HELD_REVERSALS or not isnan(p.older.v) or not best.valid:
         return fits  # many reversals leave a single one
-    rises, begins = np.diff(p.v) > 0.0, [best.p0, *(p.v[0] + best.gap * np.arange(5.0) / 4.0)]
+    begins = np.append(best.p0, p.v[0] + best.gap * np.arange(5.0) / 4.0)
+    moved = play(p.v, np.full(len(begins), best.gap), begins) != begins[:, None]
+    rises = np.diff(p.v) > 0.0
     stroke = np.cumsum(np.append([0, 0], rises[1:] != rises[:-1]))
-    first = [stroke[np.argmax(play(p.v, best.gap, p0) != p0)] for p0 in begins]
+    first = np.unique(stroke[moved.argmax(axis=1)], return_index=True)[1]
     with suppress(np.linalg.LinAlgError):
-        for p0 in (float(begins[i]) for i in np.unique(first, return_index=True)[1] if i):
+        for p0 in begins[first[first > 0]].tolist():
             held = p.step(replace(best, p0=p0), held=True, begun=True)
             fits.append(p.finished(p.fitted(held, FIRST_STEPS)))
     return fits

@@ -1,4 +1,4 @@
-"""Filters, Riccati and Lyapunov equations, pole placement, noise of a signal, normal densities.
+"""Filters and their fit, Riccati and Lyapunov equations, gains, poles, noise, normal densities.
 
 lfilter is not that of scipy.signal, which costs 0.3 s and 40 MB; scipy.linalg (31 MB) loads late.
 Reference: E. K.-W. Chu et al., Structure-preserving algorithms for periodic discrete-time algebraic

@@ -51,8 +51,8 @@ def run(
 ) -> tuple[Law, Array]:
     """A gear with a gap of 1, and (gap, its deviation, status) of each sample, shape (N, 3).
 
-    known: gap that the estimator begins with. also: what moves y besides. misled: sample at which
-    a gap of 1.3 is put in the place of what was estimated.
+    known: gap that the estimator begins with. also, noise: what moves y besides. misled: sample at
+    which a gap of 1.3 is put in the place of what was estimated.
     """
     estimator = estimator_knowing(replace(KNOWN, c_r=0.5 * known, c_l=-0.5 * known))
     held = accumulate(v.tolist(), lambda p, low: clamp(p, low, low + 1.0), initial=0.5)
