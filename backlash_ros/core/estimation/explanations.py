@@ -141,8 +141,8 @@ def afresh(
     likely = different[0].evidence - settings.FAR_BEHIND
     fits = [p.finished(p.fitted(f)) if f.evidence > likely else f for f in different]
     best = max(fits, key=lambda f: f.evidence)
-    if best.m < 0.0 or not best.left.turns:
-        return best
+    if best.m < 0.0 or (older is None and best.left.turns < setup.turns_needed):
+        return best  # not known, however precise it is
     best = mixed(p, p.with_intervals(best), fits)
     return with_walk(p, best, setup.walk_std) if walks else best
 
