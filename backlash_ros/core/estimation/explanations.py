@@ -10,7 +10,7 @@ from math import inf, isnan, sqrt
 import numpy as np
 
 from backlash_ros.core.estimation import settings
-from backlash_ros.core.estimation.fit import FIRST_STEPS, Problem
+from backlash_ros.core.estimation.fit import FEW_STEPS, FIRST_STEPS, Problem
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.posterior import Prior, WindowFit, gap_variance
 from backlash_ros.core.estimation.search import search
@@ -110,12 +110,11 @@ def afresh(
         fits += [p.finished(p.fitted(f, FIRST_STEPS))
                  for f in (p.begun(begin), replace(begin, x=np.zeros(1)))]
     known = [f for f in fits if setup.is_known(f, settings.REVERSALS)]
-    xi = known[0].theta[3:] if known else xi
     for _ in range(1 if hopeless else 2):  # the second time around the G of the best fit
         found, null = search(family, record.v, record.y, setup.noise_std, setup.widest, xi)
         if not found or found[0].evidence < null + settings.ENGAGED:
             return None
-        gaps = [f.gap for f in known]
+        gaps = [f.gap for f in known if f.behind(xi) < 1.0]  # another G, another optimum
         for evidence, gap, p0, m, peak in found:
             # Around the wrong G, the evidence of another optimum may be far too low.
             near = peak or evidence > found[0].evidence - settings.FAR_BEHIND
@@ -150,16 +149,16 @@ def afresh(
 def mixed(p: Problem, best: WindowFit, others: Sequence[WindowFit] = ()) -> WindowFit:
     """The likeliest of these fits and of others nearby, with the spread of the mixture."""
     wider, beyond = _along_the_gap(p, best)
-    fits = [f for f in (best, *others, *beyond, *_begun_elsewhere(p, best)) if f.valid]
-    alike_read = [f for f in fits if bool(f.step) == bool(best.step)]
-    likeliest = max(alike_read, key=lambda f: f.evidence, default=best)
+    alike_read = (f if bool(f.step) == bool(best.step) else p.finished(p.fitted(replace(
+        f, step=best.step, noise_std=best.noise_std), FEW_STEPS)) for f in others)
+    fits = [f for f in (best, *alike_read, *beyond, *_begun_elsewhere(p, best)) if f.valid]
+    likeliest = max(fits, key=lambda f: f.evidence, default=best)
     if likeliest.evidence > best.evidence + 0.5:  # else it is the same optimum
         return mixed(p, likeliest, fits)
     # A rival that explains the readings as well is not ruled out by what it leaves undetermined.
     w = p.at(best).weights
     value = p.log_posterior(best, w)
-    odds = np.array([max(f.evidence - best.evidence, p.log_posterior(f, w) - value
-                         if f in alike_read else -inf) for f in fits])
+    odds = np.array([max(f.evidence - best.evidence, p.log_posterior(f, w) - value) for f in fits])
     share = np.exp(odds - odds.max(initial=-inf))
     for each, f in zip(share / share.sum(), fits, strict=True):
         wider += each * apart(f, best)

@@ -85,10 +85,13 @@ def search(
             of_prior = prior[:, :, None] * np.eye(1 + k, 3 + k, 1)
             s = np.asarray(np.linalg.qr(np.concatenate([r, of_prior], axis=1), mode='r'))
             volume = np.log(prior / (np.abs(np.diagonal(s, 0, 1, 2)[:, 1:-1]) + 1e-300)).sum(axis=1)
-            evidence = np.maximum(evidence, value(s[:, -1, -1] ** 2) + volume - 0.5 * scale**2)
-        off = s[:, 1, -1] / s[:, 1, 1]
-        m = (s[:, 0, -1] - s[:, 0, 1] * off) / s[:, 0, 0]
-        p0 = np.clip(before + off / m, v[0], v[0] + g)
+            # p0 lies within the gap: what a constraint costs.
+            off = s[:, 1, -1] / s[:, 1, 1]
+            m = (s[:, 0, -1] - s[:, 0, 1] * off) / s[:, 0, 0]
+            p0 = np.clip(before + off / m, v[0], v[0] + g)
+            beyond = s[:, 1, 1] * (off - m * (p0 - before))
+            evidence = np.maximum(
+                evidence, value(s[:, -1, -1] ** 2 + beyond**2) + volume - 0.5 * scale**2)
         best = evidence.reshape(len(gaps), -1).argmax(axis=1) + np.arange(0, len(g), len(shares))
         return [Hypothesis(*one) for one in np.column_stack([evidence, g, p0, m])[best].tolist()]
 

@@ -183,7 +183,7 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
     if record.end >= before.thorough[0] or fit.cov[2, 2] < before.thorough[1]:
         fit = problem.with_intervals(fit)
         if count <= SHORT_RECORD and isnan(problem.older.v):
-            other = afresh(setup, record, None if kept.older is None else fit, kept.older, fit)
+            other = afresh(setup, record, fit, kept.older, fit)
             found = other and setup.is_known(other, settings.REVERSALS)
             fit = other if other and found else mixed(problem, fit)
             record, fit, swapped = weighed(setup, record, fit, kept.swapped, kept.older)
