@@ -90,8 +90,8 @@ def afresh(
 ) -> WindowFit | None:
     """The best fit of a search over all gaps, with the spread of rivals; None if none explains y.
 
-    like: fit whose G the search starts from. also: another fit to start from; if it knows its gap,
-    the search starts from its G and looks for other gaps. walks: try walks of u.
+    like: fit around whose G the search begins, instead of the nominal one. also: another fit to
+    start from; if it knows its gap, others are looked for around its G. walks: try walks of u.
     """
     family, swing, first = setup.family, float(np.ptp(record.v)), float(record.v[0])
     if np.isfinite(record.y).sum() < 15 + 2 * family.count or not swing:

@@ -212,8 +212,9 @@ def test_saved_estimates_of_another_plant_are_never_said_to_track(seed: int) -> 
     assert Sequence(seed).run()['wrong_inherited'] == []
 
 
-# A G that jumps where its lag does, and two plays that explain y as well as each other.
-@pytest.mark.parametrize('seed', [2009, 2207])
+# A G that jumps where its lag does, two plays that explain y as well as each other, and another G
+# with another play that explains it as well as the nominal G does (3954, 4064).
+@pytest.mark.parametrize('seed', [2009, 2207, 3954, 4064])
 @pytest.mark.filterwarnings('ignore')
 def test_one_of_two_explanations_is_not_said_to_track(seed: int) -> None:
     assert Sequence(seed).run()['wrong'] == []

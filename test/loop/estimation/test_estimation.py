@@ -135,15 +135,18 @@ def test_a_bound_that_keeps_a_good_estimate_back_is_named_with_what_was_found(na
 # The search lets the play begin where it does not, and Gauss-Newton has to pass a kink; neither
 # rounding of slow readings nor a poor fit before the first reversal is a load that coasts. Of small
 # moves, one side may say nothing of the gap where the other one says all. A square may repeat the
-# rounding of samples that were dropped, and explain y by plays that begin in different places.
+# rounding of samples that were dropped, and explain y by plays that begin in different places, or
+# by two gaps, of which one was only fitted to readings without their rounding.
 @pytest.mark.parametrize(('what', 'more'), [
     ('sine 0.5 rad/s; G known', {}), ('sine 0.2 rad/s; exact', {}),
     ('triangle 1.2 rad/s, swing 1.5', {}), ('moves 18 rad/s, swing 1.4', {}),
     ('square 6.5 rad/s, swing 20; extra_lag 0.0088', {}),
     ('square 5.1 rad/s, swing 2.6', {'structure': 'tracking'}),
+    ('square 12 rad/s, swing 16; extra_lag 0.0081', {}),
 ])
 def test_a_usual_motion_is_never_tracked_wrongly_and_blames_nothing(what, more):
-    drawn = (case for seed in (909, 5001, 15001, 16001) for case in random_cases(80, seed, 12_000))
+    drawn = (case for seed in (909, 5001, 15001, 16001, 33001)
+             for case in random_cases(130, seed, 12_000))
     case = next(one for one in (*all_cases([3]), *drawn) if one.name.startswith(what))
     found = run_case(replace(case, differs={**case.differs, **more})).faults
     assert found == [] or (found == ['late'] and what.startswith('moves'))

@@ -142,18 +142,39 @@ def test_a_motion_that_is_repeated_repeats_its_rounding_unless_noise_makes_it_di
     assert independence(np.round(moved), known, moved, 1.0)[0].tolist() == [1.0] * 30
 
 
+INTEGRATOR = PlantFamily(TransferFunction([0.0, 0.1], [1.0, -1.0]), 0.0)
+# It begins within the gap; after an integrator, what p is off by there is a drift of y.
+V = np.where(np.arange(80) < 40, 0.2, 4.0) * np.sin(0.3 * np.arange(80))
+GAP = 2.3
+
+
+def read(share: float) -> np.ndarray:
+    """y of G with p0 at this share of the gap."""
+    y = lfilter(*INTEGRATOR.at([]), play(V, GAP, V[0] + share * GAP))
+    return y + 1e-3 * np.random.default_rng(1).standard_normal(len(V))
+
+
 def test_a_beginning_between_those_compared_changes_nothing() -> None:
-    # It lasts while v stays within the gap; after an integrator, what it is off by is a drift.
-    family = PlantFamily(TransferFunction([0.0, 0.1], [1.0, -1.0]), 0.0)
-    k, gap = np.arange(80), 2.3
-    v = np.where(k < 40, 0.2, 4.0) * np.sin(0.3 * k)
-    b, a = family.at([])
-    noise = 1e-3 * np.random.default_rng(1).standard_normal(len(k))
-    found = []
-    for share in (0.07, 0.18, 0.41, 0.6):
-        y = lfilter(b, a, play(v, gap, v[0] + share * gap)) + noise
-        found.append(search(family, v, y, 1e-3, 50.0, np.zeros(0))[0][0])
+    found = [search(INTEGRATOR, V, read(share), 1e-3, 50.0, np.zeros(0))[0][0]
+             for share in (0.07, 0.18, 0.41, 0.6)]
     assert len({round(one.gap, 6) for one in found}) == 1
+
+
+def test_a_gap_is_no_likelier_than_with_the_best_beginning_within_it() -> None:
+    y, (b, a) = read(0.9), INTEGRATOR.at([])
+    found, null = search(INTEGRATOR, V, y, 1e-3, 50.0, np.zeros(0))
+    common = [lfilter([1.0], a, np.eye(1, len(V))[0]), lfilter(b, a, np.ones(len(V)))]
+
+    def value(gap: float, p0: float) -> float:
+        columns = np.array([*common, lfilter(b, a, play(V, gap, p0))]).T
+        rest = y - columns @ np.linalg.lstsq(columns, y, rcond=None)[0]
+        return float(-0.5 * (len(V) - 2) * np.log((rest @ rest + 1e-6) / len(V)))
+
+    narrow = [one for one in found if one.gap < 0.5 * GAP]
+    assert len(narrow) > 10
+    for one in narrow:
+        most = max(value(one.gap, p0) for p0 in V[0] + one.gap * np.linspace(0.0, 1.0, 41))
+        assert one.evidence < most + 0.1 * (found[0].evidence - null)
 
 
 MODELS = {
