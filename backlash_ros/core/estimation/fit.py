@@ -7,6 +7,7 @@ that ends at 0. The noise is integrated out in closed form (Normal-Gamma), the s
 the prior of s is log-normal around 1: G is expected to be about as wrong as configured.
 """
 
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from math import inf, isfinite, isnan, log, sqrt
@@ -247,10 +248,10 @@ class Problem:
         value = self.log_posterior(there, w)
         if -inf < value <= best - 0.5:
             # Beyond a kink, where the other side is engaged, a second step may succeed.
-            again = self._towards(there, self.step(there, most_scale, held, begun))
-            of_again = self.log_posterior(again, w)
-            if of_again > best:
-                there, value = again, of_again
+            with suppress(np.linalg.LinAlgError):
+                again = self._towards(there, self.step(there, most_scale, held, begun))
+                of_again = self.log_posterior(again, w)
+                there, value = (again, of_again) if of_again > best else (there, value)
         length = 1.0
         while not value > best - 0.5 and length > 0.05:
             length *= 0.3
