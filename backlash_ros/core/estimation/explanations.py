@@ -149,6 +149,7 @@ def afresh(
 def mixed(p: Problem, best: WindowFit, others: Sequence[WindowFit] = ()) -> WindowFit:
     """The likeliest of these fits and of others nearby, with the spread of the mixture."""
     wider, beyond = _along_the_gap(p, best)
+    # Only between fits that take readings in the same way can evidences be compared.
     alike_read = (f if bool(f.step) == bool(best.step) else p.finished(p.fitted(replace(
         f, step=best.step, noise_std=best.noise_std), FEW_STEPS)) for f in others)
     fits = [f for f in (best, *alike_read, *beyond, *_begun_elsewhere(p, best)) if f.valid]

@@ -85,7 +85,7 @@ def search(
             of_prior = prior[:, :, None] * np.eye(1 + k, 3 + k, 1)
             s = np.asarray(np.linalg.qr(np.concatenate([r, of_prior], axis=1), mode='r'))
             volume = np.log(prior / (np.abs(np.diagonal(s, 0, 1, 2)[:, 1:-1]) + 1e-300)).sum(axis=1)
-            # p0 lies within the gap: what a constraint costs.
+            # p0 lies within the gap: this constraint may cost likelihood.
             off = s[:, 1, -1] / s[:, 1, 1]
             m = (s[:, 0, -1] - s[:, 0, 1] * off) / s[:, 0, 0]
             p0 = np.clip(before + off / m, v[0], v[0] + g)
