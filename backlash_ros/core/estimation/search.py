@@ -89,9 +89,8 @@ def search(
             off = s[:, 1, -1] / s[:, 1, 1]
             m = (s[:, 0, -1] - s[:, 0, 1] * off) / s[:, 0, 0]
             p0 = np.clip(before + off / m, v[0], v[0] + g)
-            beyond = s[:, 1, 1] * (off - m * (p0 - before))
-            evidence = np.maximum(
-                evidence, value(s[:, -1, -1] ** 2 + beyond**2) + volume - 0.5 * scale**2)
+            squares = s[:, -1, -1] ** 2 + (s[:, 1, 1] * (off - m * (p0 - before))) ** 2
+            evidence = np.maximum(evidence, value(squares) + volume - 0.5 * scale**2)
         best = evidence.reshape(len(gaps), -1).argmax(axis=1) + np.arange(0, len(g), len(shares))
         return [Hypothesis(*one) for one in np.column_stack([evidence, g, p0, m])[best].tolist()]
 
