@@ -251,7 +251,8 @@ class Problem:
             with suppress(np.linalg.LinAlgError):
                 again = self._towards(there, self.step(there, most_scale, held, begun))
                 of_again = self.log_posterior(again, w)
-                there, value = (again, of_again) if of_again > best else (there, value)
+                if of_again > best:
+                    there, value = again, of_again
         length = 1.0
         while not value > best - 0.5 and length > 0.05:
             length *= 0.3

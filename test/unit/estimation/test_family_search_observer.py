@@ -143,7 +143,7 @@ def test_a_motion_that_is_repeated_repeats_its_rounding_unless_noise_makes_it_di
 
 
 INTEGRATOR = PlantFamily(TransferFunction([0.0, 0.1], [1.0, -1.0]), 0.0)
-# It begins within the gap; after an integrator, what p is off by there is a drift of y.
+# V stays within the gap at first; after an integrator, what p is off by there is a drift of y.
 V = np.where(np.arange(80) < 40, 0.2, 4.0) * np.sin(0.3 * np.arange(80))
 GAP = 2.3
 
