@@ -287,8 +287,12 @@ class Problem:
         e = np.bincount(run.number, (score * w)[known])  # one score per independent reading
         squares = max(float(e @ e), 1e-300)
         rho = max(float(e[lag:] @ e[:-lag]) / squares for lag in (1, 2, 4, 8) if lag < len(e))
-        dispersion = squares / max(float(w @ information), 1e-300)  # below 1, rho is unreliable
+        told = max(float(w @ information), 1e-300)
+        dispersion = squares / told  # below 1, rho is unreliable
         rho = max(rho - 3.0 / sqrt(max(count, 1.0)), 0.0) * min(dispersion, 1.0)
+        if f.step:  # only readings near an edge of their interval count; each unknown takes one
+            near = told * f.noise_std**2
+            dispersion *= near / max(near - len(f.x) - 1.0 - len(f.theta), 1.0)
         # Scaled so that merely counting more or fewer readings makes no fit likelier.
         value = float(w @ density) + count * log(self.step_of_readings or self.nominal)
         turns = len(reversals(engaged(self.v, run.p, max(f.gap, 0.0))))

@@ -277,8 +277,14 @@ def step_of(y: Array) -> float:
         return 0.0
     apart = np.diff(different)
     apart = apart[apart > even * np.median(apart)]  # not floating-point errors
-    steps = apart / apart.min()
-    return float(apart.min()) if abs(steps - np.round(steps)).max() < even else 0.0
+    step = float(apart.min())
+    for _ in range(4):  # Euclid's algorithm, as none may be a single step apart in a fast motion
+        left = np.abs(apart - step * np.round(apart / step))
+        left = left[left > even * step]
+        if not left.size:
+            return step
+        step = float(left.min())
+    return 0.0
 
 
 def isolated(flags: NDArray[np.bool_], known: NDArray[np.intp], most: float, run: int) -> \
