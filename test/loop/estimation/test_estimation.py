@@ -136,18 +136,23 @@ def test_a_bound_that_keeps_a_good_estimate_back_is_named_with_what_was_found(na
 # rounding of slow readings nor a poor fit before the first reversal is a load that coasts. Of small
 # moves, one side may say nothing of the gap where the other one says all. A square may repeat the
 # rounding of samples that were dropped, and explain y by plays that begin in different places, or
-# by two gaps, of which one was only fitted to readings without their rounding.
+# by two gaps, of which one was only fitted to readings without their rounding. Of few readings,
+# hardly more are near an edge of their interval than there are unknowns. In a fast motion, no two
+# readings may be a single step apart.
 @pytest.mark.parametrize(('what', 'more'), [
     ('sine 0.5 rad/s; G known', {}), ('sine 0.2 rad/s; exact', {}),
     ('triangle 1.2 rad/s, swing 1.5', {}), ('moves 18 rad/s, swing 1.4', {}),
     ('square 6.5 rad/s, swing 20; extra_lag 0.0088', {}),
     ('square 5.1 rad/s, swing 2.6', {'structure': 'tracking'}),
     ('square 12 rad/s, swing 16; extra_lag 0.0081', {}),
+    ('triangle 1 rad/s; ω × 1.15; 50 Hz, seed 8', {}),
+    ('moves, rests 0.5 to 1.5 s; ω × 1.15; 50 Hz, seed 12', {}),
 ])
 def test_a_usual_motion_is_never_tracked_wrongly_and_blames_nothing(what, more):
     drawn = (case for seed in (909, 5001, 15001, 16001, 33001)
              for case in random_cases(130, seed, 12_000))
-    case = next(one for one in (*all_cases([3]), *drawn) if one.name.startswith(what))
+    case = next(one for one in (*all_cases([3, 8, 12]), *drawn)
+                if f'{one.name}, seed {one.seed}'.startswith(what))
     found = run_case(replace(case, differs={**case.differs, **more})).faults
     assert found == [] or (found == ['late'] and what.startswith('moves'))
 
@@ -220,10 +225,9 @@ def test_plant_without_a_gap_is_recognised() -> None:
 SHIPPED = ROOT / 'config'
 
 
-@pytest.mark.parametrize('amplitude', [0.8, 1.2])
+@pytest.mark.parametrize('amplitude', [0.8, 1.0])
 def test_a_triangle_read_by_an_encoder_is_learned_from(amplitude: float) -> None:
-    # One speed tells a lag from a gap at the turns alone. At the amplitude of the file, 1, y moves
-    # by 26.08 steps of the encoder per sample: rounding that repeats is too coloured to learn from.
+    # One speed tells a lag from a gap at the turns alone.
     p = read_configuration(SHIPPED / 'geared_motor.yaml').given()
     changed = Parameters({**p, 'waveform': 'triangle', 'amplitude': amplitude})
     record = build_closed_loop(changed).run(1600)

@@ -15,7 +15,7 @@ from strategies import output_of, plants
 
 from backlash_ros.core.assembly import build_controller, takes_model_as_exact, warnings_of
 from backlash_ros.core.parameters import ParameterError, Parameters
-from backlash_ros.core.plant.numerics import lfilter, lyapunov, riccati
+from backlash_ros.core.plant.numerics import lfilter, lyapunov, riccati, step_of
 from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
 
 
@@ -151,3 +151,11 @@ def test_what_has_no_solution_is_refused() -> None:
 def test_a_controller_whose_fits_are_made_elsewhere_does_not_load_scipy() -> None:
     done = subprocess.run([sys.executable, '-c', LEARNS], capture_output=True, text=True)
     assert done.stdout.strip() == '[]', done.stdout + done.stderr
+
+
+@pytest.mark.parametrize(('moves', 'step'), [
+    ([7, 2, 9, 1, 40, 25, 6, 11, 5], 0.25), ([35, 10, 45, 14, 40, 25, 6, 55, 77], 0.25),
+    (np.sqrt([2, 3, 5, 7, 11, 13, 17, 19, 23]), 0.0),
+])
+def test_the_step_of_readings_is_found_though_none_are_that_close(moves, step):
+    assert step_of(0.1 + 0.25 * np.cumsum(moves)) == pytest.approx(step, abs=1e-9)
