@@ -28,7 +28,7 @@ from reporting import ROOT, format_table, markdown_table, parallel, parser_of, w
 from backlash_ros.core import Status
 
 AMPLITUDE = 0.5  # of y_m [rad]
-FIVE_PERIODS = 10  # reversals of u: none that stays within the gap reaches the load
+FIVE_PERIODS = 10  # reversals
 IN_TIME = 6  # reversals within which *tracking* is due
 CLOSE = 0.005  # error at five periods [gap]
 LEAST_S = 12.0  # of a periodic motion
@@ -152,8 +152,8 @@ class Case:
 class Result:
     """What came of one run; errors are those of c_r or c_l, the worse one.
 
-    learned: reversals of u until the first sample that is *tracking* with at most 1 % of the gap
-    of error; first: until the first *tracking*; None for never.
+    learned: reversals that reached the load, until the first sample that is *tracking* with at most
+    1 % of the gap of error; first: until the first *tracking*; None for never.
     at_five: error at five periods (ten reversals, or the end), in gaps; std_five: its published
     deviation in gaps, None without one. Of the *tracking* samples, None without any: rms: RMS of
     error over deviation, no larger than ten; beyond: share with more than five deviations; wrong:
@@ -262,7 +262,9 @@ def run_case(case: Case) -> Result:
     # A constant that is added to u moves both crossings.
     offset = float(str(case.differs.get('input_disturbance', 0.0)))
     run = judged(record, offset / backlash['backlash.m'])
-    reversals, omega = reversals_of(record.column('u')), case.shape.omega
+    # A reversal that stays within the gap does not reach the load; u also turns at a step of v.
+    reversals = np.minimum(reversals_of(y_m), reversals_of(record.column('u')))
+    omega = case.shape.omega
     five = round(5 * 2 * pi * case.rate / omega) if omega \
         else int(np.argmax(reversals >= FIVE_PERIODS)) or len(y_m)
     five = min(five, len(y_m) - 1)
@@ -279,11 +281,11 @@ def run_case(case: Case) -> Result:
     )
 
 
-def reversals_of(u: Array) -> NDArray[np.int_]:
-    """How often u has turned back up to every sample, shape (N,)."""
-    moves = np.sign(np.diff(u, prepend=u[:1]))
+def reversals_of(signal: Array) -> NDArray[np.int_]:
+    """How often a signal (N,) has turned back up to every sample, shape (N,)."""
+    moves = np.sign(np.diff(signal, prepend=signal[:1]))
     moving = np.flatnonzero(moves)
-    turned = np.zeros(len(u), dtype=int)
+    turned = np.zeros(len(signal), dtype=int)
     turned[moving[1:]] = moves[moving[1:]] != moves[moving[:-1]]
     return np.asarray(np.cumsum(turned))
 

@@ -257,6 +257,9 @@ class Problem:
         while not value > best - 0.5 and length > 0.05:
             length *= 0.3
             there = self._towards(f, new, length)
+            if length > 0.2:  # the first of these: another xi needs another X, which is linear in y
+                with suppress(np.linalg.LinAlgError):
+                    there = self.begun(there)
             value = self.log_posterior(there, w)
         return new, there, value
 
@@ -309,7 +312,7 @@ class Problem:
         columns = self.jacobian(there)[self.known][:, unknown]
         best = np.linalg.lstsq(columns, run.error[self.known], rcond=1e-12)[0]
         theta = f.theta.copy()
-        theta[1] += best[-1] * offset
+        theta[1] += best[-1] if offset else 0.0
         return replace(f, x=best[:len(run.a) - 1], theta=theta)
 
     def with_intervals(self, f: WindowFit) -> WindowFit:

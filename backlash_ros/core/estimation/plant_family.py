@@ -16,7 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.plant.numerics import multiplied, padded
-from backlash_ros.core.plant.transfer_function import ON_CIRCLE, Array, TransferFunction, memory_of
+from backlash_ros.core.plant.transfer_function import (
+    ON_CIRCLE,
+    Array,
+    TransferFunction,
+    memory_of,
+    sections_of,
+)
 
 # G jumps where i changes: so far below a whole number of samples, which is the most usual lag. This
 # leaves at most a hundredth of a dead time unexplained.
@@ -41,7 +47,7 @@ class PlantFamily:
         # Denominator of the poles that are kept, except the first integrator, which may leak.
         rest = np.concatenate([poles[elsewhere & ~moving], poles[integrators][1:].round()])
         self._rest: list[float] = np.atleast_1d(np.real(np.poly(rest))).tolist()
-        self._pairs, self._nominal = _sections(poles[moving])
+        self._pairs, self._nominal = sections_of(poles[moving])
         a = [x.real for x in self._stable(self._nominal)]
         self._gain, self._delay = sum(a), len(model.denominator) - len(b)
         # Delay of B and of A at low frequency [samples]. However short, by default a lag of one
@@ -114,15 +120,3 @@ class PlantFamily:
         powers = 1.0 / z[:, None] ** np.arange(db.shape[1])
         of_b, of_a = (powers[:, :len(x)] @ np.array(x) for x in self.at(xi))
         return np.asarray(powers @ db.T / of_b[:, None] - powers @ da.T / of_a[:, None])
-
-
-def _sections(poles: NDArray[np.complex128]) -> tuple[int, list[float]]:
-    """Number of pairs of poles; ln Omega, ln D of each, then ln of a real pole left over."""
-    s = np.log(poles.astype(complex))
-    pairs = [(abs(x), -x.real / abs(x)) for x in s if x.imag > 1e-9]
-    real = sorted(-x.real for x in s if abs(x.imag) <= 1e-9)
-    while len(real) > 1:
-        fast, next_to_it = real.pop(), real.pop()
-        omega = np.sqrt(fast * next_to_it)
-        pairs.append((omega, (fast + next_to_it) / 2.0 / omega))
-    return len(pairs), np.log([*(q for pair in pairs for q in pair), *real]).tolist()
