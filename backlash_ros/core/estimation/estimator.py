@@ -43,6 +43,7 @@ class Fitted(NamedTuple):
     better: Proposal | None = None
 
 
+@np.errstate(all='ignore')
 def fitted(
     samples: Window, setup: Setup, before: Belief, model: TransferFunction, proposed: Array,
 ) -> Fitted:

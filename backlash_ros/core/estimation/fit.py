@@ -258,8 +258,7 @@ class Problem:
             length *= 0.3
             there = self._towards(f, new, length)
             if length > 0.2:  # the first of these: another xi needs another X, which is linear in y
-                with suppress(np.linalg.LinAlgError):
-                    there = self.begun(there)
+                there = self.begun(there)
             value = self.log_posterior(there, w)
         return new, there, value
 
@@ -293,9 +292,8 @@ class Problem:
         told = max(float(w @ information), 1e-300)
         dispersion = squares / told  # below 1, rho is unreliable
         rho = max(rho - 3.0 / sqrt(max(count, 1.0)), 0.0) * min(dispersion, 1.0)
-        if f.step:  # only readings near an edge of their interval count; each unknown takes one
-            near = told * f.noise_std**2
-            dispersion *= near / max(near - len(f.x) - 1.0 - len(f.theta), 1.0)
+        near = told * f.noise_std**2  # readings near an edge of their interval; unknowns take some
+        dispersion *= near / max(near - len(f.x) - 1.0 - len(f.theta), 1.0)
         # Scaled so that merely counting more or fewer readings makes no fit likelier.
         value = float(w @ density) + count * log(self.step_of_readings or self.nominal)
         turns = len(reversals(engaged(self.v, run.p, max(f.gap, 0.0))))
@@ -305,14 +303,15 @@ class Problem:
             value, rms, rho, dispersion if f.step else 1.0, count, turns, gain))
 
     def begun(self, f: WindowFit, offset: bool = False) -> WindowFit:
-        """This fit with X, and o too if `offset`, from linear least squares; all else is held."""
-        there = replace(f, x=np.zeros(1))
+        """This fit with X, and o too if `offset`, from linear least squares; f if y overflows."""
+        there = replace(f, x=np.zeros(1), step=0.0)  # far from the intervals
         run, of_o = self.at(there), -2 - self.family.count
         unknown = [*range(len(run.a) - 1), *[of_o] * offset]
-        columns = self.jacobian(there)[self.known][:, unknown]
-        best = np.linalg.lstsq(columns, run.error[self.known], rcond=1e-12)[0]
-        theta = f.theta.copy()
-        theta[1] += best[-1] if offset else 0.0
+        rows = np.column_stack([self.jacobian(there)[:, unknown], run.error])[self.known]
+        if not np.isfinite(rows).all():
+            return f
+        best = np.linalg.lstsq(rows[:, :-1], rows[:, -1], rcond=1e-12)[0]
+        theta = f.theta + np.eye(1, len(f.theta), 1)[0] * (best[-1] if offset else 0.0)
         return replace(f, x=best[:len(run.a) - 1], theta=theta)
 
     def with_intervals(self, f: WindowFit) -> WindowFit:

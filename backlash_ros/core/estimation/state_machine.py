@@ -39,13 +39,12 @@ def learn(setup: Setup, record: Window, before: Belief) -> Belief:
     look = {State.SEARCHING: _searching, State.KNOWN: _known, State.DOUBTED: _doubted}
     kept, record = before.kept, record.without(before.kept.rejected)
     try:
-        with np.errstate(all='ignore'):
-            if before.fit is not None and record.is_open:  # late commands are no contradiction
-                p, thorough = setup.problem(record, kept.older), record.end >= before.thorough[0]
-                since = record.first if thorough else before.end - setup.family.memory
-                record, swapped = likelier(p, before.fit, record, since, kept.swapped)
-                before = before._replace(kept=kept._replace(swapped=swapped))
-            return look[before.state](setup, record, before)
+        if before.fit is not None and record.is_open:  # late commands are no contradiction
+            p, thorough = setup.problem(record, kept.older), record.end >= before.thorough[0]
+            since = record.first if thorough else before.end - setup.family.memory
+            record, swapped = likelier(p, before.fit, record, since, kept.swapped)
+            before = before._replace(kept=kept._replace(swapped=swapped))
+        return look[before.state](setup, record, before)
     except np.linalg.LinAlgError:
         first = max(record.end - settings.FIRST_FIT, record.first)
         return _begun_anew(before, first, record.end, record.end + FEWEST)

@@ -10,7 +10,15 @@ from cases.held_up import HeldUpProcesses
 from cases.loops import motor
 from contract.figures import judged
 from contract.learning_rows import PAPER as EXACT
-from contract.learning_rows import Job, Outcome, changes_jobs, learned_again_s, run_job
+from contract.learning_rows import (
+    RANDOM_KINDS,
+    Job,
+    Outcome,
+    changes_jobs,
+    learned_again_s,
+    run_job,
+    run_random,
+)
 from ordinary_motions import all_cases, random_cases, run_case
 from places import ROOT
 from scipy.special import chdtri
@@ -155,6 +163,12 @@ def test_a_usual_motion_is_never_tracked_wrongly_and_blames_nothing(what, more):
                 if f'{one.name}, seed {one.seed}'.startswith(what))
     found = run_case(replace(case, differs={**case.differs, **more})).faults
     assert found == [] or (found == ['late'] and what.startswith('moves'))
+
+
+@pytest.mark.parametrize('seed', [144, 308])
+def test_a_step_that_is_held_back_takes_the_state_that_suits_it(seed):
+    # Plants of higher order, on which a shorter step along the same line leads nowhere.
+    assert run_random((RANDOM_KINDS[2], seed)).relative < 0.01
 
 
 NOISE = 1e-3
