@@ -9,6 +9,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.settings import GATE, OUTLIER_SHARE
+from backlash_ros.core.plant.numerics import step_of
 from backlash_ros.core.plant.transfer_function import Array
 
 Flags = NDArray[np.bool_]
@@ -20,16 +21,17 @@ TO_STD = 1.4826  # standard deviation of a normal distribution over its median a
 
 
 def quantum(y: Array) -> float:
-    """Quantization step of y (N,), 0 if it is not quantised."""
+    """Quantization step of y (N,), 0 if it is not quantised; with few digits only if y repeats."""
     values = np.unique(y[np.isfinite(y)])
     if len(values) < 2 or len(values) > 0.8 * len(y):
-        return 0.0
+        return step_of(y)
     steps = np.diff(values)
     steps[steps <= 1e-9 * (values[-1] - values[0])] = 0.0
     # Counted from value to value, as a file may have fewer digits than the step.
     numbers = np.append(0.0, np.cumsum(np.round(steps / steps[steps > 0.0].min())))
     step = float((values[-1] - values[0]) / numbers[-1])
-    return step if np.abs((values - values[0]) / step - numbers).max() < 0.05 else 0.0
+    few = np.abs((values - values[0]) / step - numbers).max() < 0.05
+    return step if few else step_of(y)
 
 
 def own_readings(t: Array, y: Array) -> tuple[Flags, float]:

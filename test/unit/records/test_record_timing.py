@@ -349,6 +349,8 @@ def test_what_v_does_and_what_is_no_turn_is_kept(v: Array, y: Array) -> None:
     (MOTION, 0.0), (np.round(MOTION, 1), 0.1), (0.25 * np.round(200.0 * MOTION) + 8e8, 0.25),
     # an encoder, in a file of few digits
     (np.round(np.round(MOTION * 64.0) / 64.0, 3), 1.0 / 64.0), (np.full(9, 3.0), 0.0),
+    # of a fast motion, none of them twice
+    (0.25 * np.cumsum([35.0, 10.0, 45.0, 14.0, 40.0, 25.0, 6.0, 55.0]), 0.25),
 ])
 def test_the_step_of_a_quantised_y_is_told(y: Array, step: float) -> None:
     assert readings.quantum(y) == pytest.approx(step, rel=1e-3)
