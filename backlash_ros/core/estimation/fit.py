@@ -24,6 +24,7 @@ from backlash_ros.core.plant.numerics import (
     padded,
     sensitivities,
     shifted,
+    state_responses,
     step_of,
     triangle,
 )
@@ -305,13 +306,16 @@ class Problem:
     def begun(self, f: WindowFit, offset: bool = False) -> WindowFit:
         """This fit with X, and o too if `offset`, from linear least squares; f if y overflows."""
         there = replace(f, x=np.zeros(1), step=0.0)  # far from the intervals
-        run, of_o = self.at(there), -2 - self.family.count
-        unknown = [*range(len(run.a) - 1), *[of_o] * offset]
-        rows = np.column_stack([self.jacobian(there)[:, unknown], run.error])[self.known]
+        run, count = self.at(there), len(self.v)
+        columns = [*state_responses(run.a, count)]
+        if offset:
+            columns.append(lfilter(run.b, [1.0], lfilter([1.0], run.a, np.full(count, -1.0))))
+        rows = np.column_stack([*columns, run.error])[self.known]
         if not np.isfinite(rows).all():
             return f
         best = np.linalg.lstsq(rows[:, :-1], rows[:, -1], rcond=1e-12)[0]
-        theta = f.theta + np.eye(1, len(f.theta), 1)[0] * (best[-1] if offset else 0.0)
+        theta = f.theta.copy()
+        theta[1] += best[len(run.a) - 1:].sum()  # of nothing, unless `offset`
         return replace(f, x=best[:len(run.a) - 1], theta=theta)
 
     def with_intervals(self, f: WindowFit) -> WindowFit:

@@ -15,14 +15,8 @@ from math import copysign, floor, inf
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.plant.numerics import multiplied, padded
-from backlash_ros.core.plant.transfer_function import (
-    ON_CIRCLE,
-    Array,
-    TransferFunction,
-    memory_of,
-    sections_of,
-)
+from backlash_ros.core.plant.numerics import multiplied, padded, sections_of
+from backlash_ros.core.plant.transfer_function import ON_CIRCLE, Array, TransferFunction, memory_of
 
 # G jumps where i changes: so far below a whole number of samples, which is the most usual lag. This
 # leaves at most a hundredth of a dead time unexplained.

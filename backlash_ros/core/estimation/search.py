@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.settings import ROWS
 from backlash_ros.core.plant.backlash import play
-from backlash_ros.core.plant.numerics import lfilter, sensitivities, shifted
+from backlash_ros.core.plant.numerics import lfilter, sensitivities, state_responses
 from backlash_ros.core.plant.transfer_function import Array, Family
 
 
@@ -43,8 +43,7 @@ def search(
         """Columns (..., N) summed over bins, each divided by the root of its number of readings."""
         return np.asarray(np.add.reduceat(columns * known, begins, axis=-1) * weights)
 
-    of_state = shifted(lfilter([1.0], a, np.eye(1, len(v))[0]), len(a) - 1)
-    common = np.vstack([of_state, lfilter(b, a, np.ones(len(v)))])
+    common = np.vstack([state_responses(a, len(v)), lfilter(b, a, np.ones(len(v)))])
     q = np.linalg.qr(averaged(common).T)[0]
     freedom = max(q.shape[0] - q.shape[1], 1)
 

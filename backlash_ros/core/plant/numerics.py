@@ -61,6 +61,14 @@ def shifted(x: Array, count: int) -> Array:
     return out
 
 
+def state_responses(a: Sequence[float], count: int) -> Array:
+    """Derivatives of the response X/A(z) to the state before a record by each value of X, (n, N).
+
+    a: coefficients of A (n + 1,). count: N.
+    """
+    return shifted(lfilter([1.0], a, np.eye(1, count)[0]), len(a) - 1)
+
+
 def sensitivities(family: Family, xi: list[float], u: Array, y: Array) -> Array:
     """Derivatives of y by each xi, (..., K, N); u, y: input and output filtered by 1/A."""
     of_b, of_a = family.slopes(xi)
@@ -78,6 +86,19 @@ def multiplied(*factors: Sequence[complex]) -> list[complex]:
                 out[i + j] += x * y
         result = out
     return result
+
+
+def sections_of(poles: NDArray[np.complex128]) -> tuple[int, list[float]]:
+    """Number of pairs among these poles of z (n,), s^2 + 2 D Omega s + Omega^2 at sample period 1;
+    ln Omega, ln D of each pair, then ln of the rate of a real pole left over."""
+    s = np.log(poles.astype(complex))
+    pairs = [(abs(x), -x.real / abs(x)) for x in s if x.imag > 1e-9]
+    real = sorted(-x.real for x in s if abs(x.imag) <= 1e-9)
+    while len(real) > 1:
+        fast, next_to_it = real.pop(), real.pop()
+        omega = np.sqrt(fast * next_to_it)
+        pairs.append((omega, (fast + next_to_it) / 2.0 / omega))
+    return len(pairs), np.log([*(q for pair in pairs for q in pair), *real]).tolist()
 
 
 def is_stable(a: list[float]) -> bool:
@@ -269,7 +290,7 @@ class NoiseLevel:
 def step_of(y: Array) -> float:
     """The quantization step, of which all differences of readings (N,) are multiples; 0 if none.
 
-    Unlike `records.readings.quantum` it needs no repeated readings, but all their digits.
+    It needs no repeated readings, but all their digits.
     """
     even = 1e-3  # tolerance of that, in steps
     different = np.unique(y[np.isfinite(y)])

@@ -144,19 +144,6 @@ def powers(a: Array, b: Array, count: int) -> Array:
     return stack[:count]
 
 
-def sections_of(poles: NDArray[np.complex128]) -> tuple[int, list[float]]:
-    """Number of pairs among these poles of z (n,), s^2 + 2 D Omega s + Omega^2 at sample period 1;
-    ln Omega, ln D of each pair, then ln of the rate of a real pole left over."""
-    s = np.log(poles.astype(complex))
-    pairs = [(abs(x), -x.real / abs(x)) for x in s if x.imag > 1e-9]
-    real = sorted(-x.real for x in s if abs(x.imag) <= 1e-9)
-    while len(real) > 1:
-        fast, next_to_it = real.pop(), real.pop()
-        omega = np.sqrt(fast * next_to_it)
-        pairs.append((omega, (fast + next_to_it) / 2.0 / omega))
-    return len(pairs), np.log([*(q for pair in pairs for q in pair), *real]).tolist()
-
-
 def check_model(model: TransferFunction) -> None:
     """Raise ParameterError, with the reason, if m, c_r, c_l cannot be learned through this G."""
     poles, numerator = model.poles, model.numerator.tolist()
