@@ -21,17 +21,21 @@ TO_STD = 1.4826  # standard deviation of a normal distribution over its median a
 
 
 def quantum(y: Array) -> float:
-    """Quantization step of y (N,), 0 if it is not quantised; with few digits only if y repeats."""
+    """Quantization step of y (N,), 0 if it is not quantised."""
+    return _repeated_step(y) or step_of(y)
+
+
+def _repeated_step(y: Array) -> float:
+    """The same, of readings that repeat, even in a file of few digits; 0 if they do not."""
     values = np.unique(y[np.isfinite(y)])
     if len(values) < 2 or len(values) > 0.8 * len(y):
-        return step_of(y)
+        return 0.0
     steps = np.diff(values)
     steps[steps <= 1e-9 * (values[-1] - values[0])] = 0.0
     # Counted from value to value, as a file may have fewer digits than the step.
     numbers = np.append(0.0, np.cumsum(np.round(steps / steps[steps > 0.0].min())))
     step = float((values[-1] - values[0]) / numbers[-1])
-    few = np.abs((values - values[0]) / step - numbers).max() < 0.05
-    return step if few else step_of(y)
+    return step if np.abs((values - values[0]) / step - numbers).max() < 0.05 else 0.0
 
 
 def own_readings(t: Array, y: Array) -> tuple[Flags, float]:
