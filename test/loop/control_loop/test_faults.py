@@ -77,7 +77,7 @@ def test_reports_of_an_encoder_with_another_zero_still_teach_the_crossings_of_v(
 
 
 def test_lost_controls_that_nobody_reports_are_found_or_said_to_be_inconsistent() -> None:
-    wrong, inconsistent, far = [], [], 0
+    wrong, inconsistent, far = [], [], []
     for seed in range(1, 15):
         world = SimulatedLoop()
         world.learn()
@@ -94,9 +94,10 @@ def test_lost_controls_that_nobody_reports_are_found_or_said_to_be_inconsistent(
         wrong.append(np.mean(tracking & beyond.any(axis=1)))
         # What is lost looks like a disturbance that walks: both crossings move, and say so. In some
         # runs, swaps that did not happen explain as much as those that did.
-        far += (off / np.abs(TRUTH)).max() > 0.4
+        far.append((off / np.abs(TRUTH)).max())
         world.check_sanity()
-    assert far <= 2
+    assert np.sum(np.array(far) > 0.4) <= 2
+    assert max(far) < 0.8
     assert np.mean(inconsistent) > 0.2
     assert np.mean(wrong) < 0.05
 
