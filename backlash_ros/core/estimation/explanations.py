@@ -53,8 +53,7 @@ class Setup:
 
     def are_precise(self, crossings: Array, cov: Array, systematic: bool) -> bool:
         """Whether m, c_r, c_l (3,) of this covariance (3, 3) are known well enough."""
-        # Systematic errors do not average out.
-        factor = 1.0 / settings.BY_CHANCE if systematic else 1.0
+        factor = 1.0 / settings.BY_CHANCE if systematic else 1.0  # these do not average out
         m, c_r, c_l = map(float, crossings)
         std_m, *std = map(float, np.sqrt(np.maximum(np.diag(cov), 0.0)))
         gap, gap_std = c_r - c_l, sqrt(gap_variance(cov))
@@ -179,8 +178,7 @@ def _begun_elsewhere(p: Problem, best: WindowFit) -> list[WindowFit]:
         return fits  # many reversals leave a single one
     begins = np.append(best.p0, p.v[0] + best.gap * np.arange(5.0) / 4.0)
     moved = play(p.v, np.full(len(begins), best.gap), begins) != begins[:, None]
-    rises = np.diff(p.v) > 0.0
-    stroke = np.cumsum(np.append([0, 0], rises[1:] != rises[:-1]))
+    stroke = np.repeat(np.arange(len(p.strokes.ends)), p.strokes.lengths)
     first = np.unique(stroke[moved.argmax(axis=1)], return_index=True)[1]
     with suppress(np.linalg.LinAlgError):
         for p0 in begins[first[first > 0]].tolist():

@@ -10,6 +10,7 @@ the prior of s is log-normal around 1: G is expected to be about as wrong as con
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
+from itertools import pairwise
 from math import inf, isfinite, isnan, log, sqrt
 from typing import NamedTuple
 
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimation import posterior
 from backlash_ros.core.estimation.posterior import Prior, WindowFit
-from backlash_ros.core.plant.backlash import Region, engaged, play, reversals
+from backlash_ros.core.plant.backlash import Region, engaged, play, reversals, strokes_of
 from backlash_ros.core.plant.numerics import (
     lfilter,
     padded,
@@ -60,7 +61,7 @@ class Problem:
         self, family: Family, v: Array, y: Array, noise_std: float, older: Prior | None = None,
         step: float | None = None,
     ) -> None:
-        self.family, self.v, self.nominal = family, v, noise_std
+        self.family, self.v, self.nominal, self.strokes = family, v, noise_std, strokes_of(v)
         self.older = older or Prior(np.zeros((0, 3 + family.count)), np.zeros(0))
         self._leaks = 0 if self.older.rows[:, 3:].any() else family.leaks  # prior not counted yet
         self.known = np.isfinite(y)
@@ -71,7 +72,7 @@ class Problem:
     def at(self, f: WindowFit) -> Run:
         """The record simulated with the values of this fit; the last three results are kept."""
         if f not in self._runs:
-            p = play(self.v, max(f.gap, 0.0), f.p0)
+            p = play(self.v, max(f.gap, 0.0), f.p0, self.strokes)
             hats, knots, _ = self._walk_of(f)
             u = f.m * p - f.theta[1] + knots @ hats
             b, a = self.family.at(f.xi)
@@ -177,7 +178,7 @@ class Problem:
         of_samples = np.vstack([jacobian.T, jacobian @ beta + score / information])
         of_samples *= np.sqrt(information * run.weights)
         at = len(x) + len(knots) + 1  # index of m
-        *unit, target = np.eye(len(beta) + 1)
+        *unit, target, none = np.eye(len(beta) + 2, len(beta) + 1)
         p0, gap, older = unit[at - 1], unit[at + 2], self.older
         begin = sqrt(12.0) / max(f.gap, 1e-9) * (p0 + (first + 0.5 * f.gap) * target) \
             if isnan(older.v) else tight * (p0 - older.left * gap + older.v * target)
@@ -188,7 +189,7 @@ class Problem:
             *unit[at + 3:at + 3 + self._leaks],
             # Keeps X finite where no reading determines it, as when the first ones were lost.
             *(row / (vague * max(float(np.abs(self.y).max()), 1e-300)) for row in unit[:len(x)]),
-            *-np.diff([*unit[len(x):at - 1], 0.0 * target], axis=0) / knot_std,
+            *((one - other) / knot_std for one, other in pairwise([*unit[len(x):at - 1], none])),
             *np.column_stack([np.zeros((len(older.rows), at)), older.rows, older.values])]
         return np.hstack([of_samples, np.array(beside).T]).T
 

@@ -10,6 +10,7 @@ pole left over. Poles at 0, on the negative axis or outside the unit circle are 
 
 from cmath import cos, exp, sqrt
 from collections.abc import Sequence
+from functools import lru_cache
 from math import copysign, floor, inf
 
 import numpy as np
@@ -42,7 +43,7 @@ class PlantFamily:
         rest = np.concatenate([poles[elsewhere & ~moving], poles[integrators][1:].round()])
         self._rest: list[float] = np.atleast_1d(np.real(np.poly(rest))).tolist()
         self._pairs, self._nominal = sections_of(poles[moving])
-        a = [x.real for x in self._stable(self._nominal)]
+        a = [x.real for x in _stable(self._pairs, *self._nominal)]
         self._gain, self._delay = sum(a), len(model.denominator) - len(b)
         # Delay of B and of A at low frequency [samples]. However short, by default a lag of one
         # sample is usual: a driver may apply v, or read y, a sample later than expected.
@@ -71,7 +72,7 @@ class PlantFamily:
         h = 1e-30
         rows = [self._coefficients([x + 1j * h * (i == j) for i, x in enumerate(xi)])
                 for j in range(len(xi))]
-        shape = len(xi), 2, len(self.at(xi)[1])
+        shape = len(xi), 2, len((rows[0] if rows else self.at(xi))[1])
         of_b, of_a = np.array(rows, complex).reshape(shape).imag.swapaxes(0, 1) / h
         return of_b, of_a
 
@@ -82,7 +83,7 @@ class PlantFamily:
         moved = moved or [0.0] * (2 + len(self._nominal))
         integrator = [1.0, -1.0 + (moved.pop(0) if self.leaks else 0.0)] * self.integrates
         lag, width, *logs = moved
-        stable = self._stable([x + y for x, y in zip(self._nominal, logs, strict=True)])
+        stable = _stable(self._pairs, *[x + y for x, y in zip(self._nominal, logs, strict=True)])
         whole = max(floor(lag.real + BEFORE_WHOLE), 1 - self._delay)
         gain = sum(stable) / self._gain
         b = [0j] * (self._delay + whole - 1) + [
@@ -93,15 +94,6 @@ class PlantFamily:
             b.pop()
         length = max(len(a), len(b))
         return b + [0j] * (length - len(b)), a + [0j] * (length - len(a))
-
-    def _stable(self, logs: Sequence[complex]) -> list[complex]:
-        """Denominator of the poles that depend on xi, given logs of their parameters."""
-        pairs = zip(logs[:2 * self._pairs:2], logs[1:2 * self._pairs:2], strict=True)
-        a = [1.0 + 0j]
-        for omega, damping in ((exp(x), exp(y)) for x, y in pairs):
-            r, square = exp(-omega * damping), omega * omega * (1.0 - damping * damping)
-            a = multiplied(a, [1.0, -2.0 * r * cos(sqrt(square)), r * r])
-        return multiplied(a, *([1.0, -exp(-exp(value))] for value in logs[2 * self._pairs:]))
 
     def model_at(self, xi: list[float]) -> TransferFunction:
         b, a = (np.trim_zeros(np.array(x), 'b') for x in ([0.0, *self.at(xi)[0]], self.at(xi)[1]))
@@ -114,3 +106,14 @@ class PlantFamily:
         powers = 1.0 / z[:, None] ** np.arange(db.shape[1])
         of_b, of_a = (powers[:, :len(x)] @ np.array(x) for x in self.at(xi))
         return np.asarray(powers @ db.T / of_b[:, None] - powers @ da.T / of_a[:, None])
+
+
+@lru_cache(maxsize=64)  # of the derivatives by xi, only those by poles change them
+def _stable(pairs: int, *logs: complex) -> tuple[complex, ...]:
+    """Denominator of the poles that depend on xi, given logs of their parameters."""
+    a = [1.0 + 0j]
+    for log_omega, log_damping in zip(logs[:2 * pairs:2], logs[1:2 * pairs:2], strict=True):
+        omega, damping = exp(log_omega), exp(log_damping)
+        r, square = exp(-omega * damping), omega * omega * (1.0 - damping * damping)
+        a = multiplied(a, [1.0, -2.0 * r * cos(sqrt(square)), r * r])
+    return tuple(multiplied(a, *([1.0, -exp(-exp(value))] for value in logs[2 * pairs:])))

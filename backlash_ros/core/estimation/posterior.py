@@ -236,10 +236,10 @@ def error_of_plant(
         return np.zeros(0), np.zeros((0, 0)), f.scale, 0.0, variance
     u, singular, vt = np.linalg.svd(r[:k, :k])
     z, scales = u.T @ r[:k, k], SCALES[most_scale >= SCALES][:, None]
-    noise = np.full((len(scales), 1), variance)
+    noise, told, power = np.full((len(scales), 1), variance), (scales * singular) ** 2, z**2
     for _ in range(1 if f.step else 4):  # noise and shrinkage depend on each other
-        shrink = 1.0 / (1.0 + (scales * singular) ** 2 / noise)
-        left = squares + (shrink * z**2).sum(axis=1, keepdims=True)
+        shrink = 1.0 / (1.0 + told / noise)
+        left = squares + (shrink * power).sum(axis=1, keepdims=True)
         noise = noise if f.step else left / freedom
     fits = left if f.step else freedom * np.log(left)
     volumes = 0.5 * (np.log(shrink).sum(axis=1) - np.log(scales[:, 0]) ** 2)

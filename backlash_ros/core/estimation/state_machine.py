@@ -126,7 +126,8 @@ def _why(setup: Setup, found: WindowFit | None, record: Window, before: Belief) 
     gap = max(found.gap, setup.guess)
     turns = record.turns(gap, float(record.v[0]))
     large = turns >= settings.HELD_REVERSALS or (
-        turns >= setup.turns_needed and found.unexplained * found.gap > settings.NEGLIGIBLE * gap)
+        turns >= setup.turns_needed and found.unexplained * found.gap > settings.NEGLIGIBLE * gap
+        and before.found is not None)  # of so few reversals a single fit may miss the optimum
     wrong = setup.moves_against(found) or (large and found.systematic and setup.noisier(found))
     return Status.INCONSISTENT if wrong or (known and setup.is_known(found)) else Status.ACQUIRING
 

@@ -5,6 +5,7 @@ v while the right side is engaged, and on v + gap while the left one is.
 """
 
 from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,22 +55,41 @@ class Backlash:
         return self.u
 
 
-def play(v: Array, gap: Array | float, before: Array | float) -> Array:
+class Strokes(NamedTuple):
+    """The strokes of v, from one turn to the next; play is stepped through their ends only."""
+
+    rises: NDArray[np.bool_]  # whether v rises in the stroke of each sample (N,)
+    ends: list[tuple[float, bool]]  # v at the end of each stroke, and whether v rises in it
+    lengths: NDArray[np.intp]  # number of samples of each
+
+
+def strokes_of(v: Array) -> Strokes:
+    """Return the strokes of v (N,); the first sample belongs to the first of them."""
+    rises = np.zeros(len(v), np.bool_)
+    np.greater(v[1:], v[:-1], out=rises[1:])
+    rises[:1] = rises[1:2].any()
+    turns = np.append(np.flatnonzero(rises[1:] != rises[:-1]), len(v) - 1)
+    ends = list(zip(v[turns].tolist(), rises[turns].tolist(), strict=True))
+    return Strokes(rises, ends, np.diff(turns, prepend=-1))
+
+
+def play(
+    v: Array, gap: Array | float, before: Array | float, strokes: Strokes | None = None,
+) -> Array:
     """Return p after each v (N,); before: p before the first. For H gaps and befores: (H, N).
 
-    Between two turns of v, p is the larger of v and the held value, or the smaller of that and
-    v + gap: so only the turns are stepped through.
+    Within a stroke of v, p is the larger of v and the held value, or the smaller of that and
+    v + gap. strokes: those of v, if they are known already.
     """
-    rises = np.append(False, v[1:] > v[:-1])
-    turns = np.append(np.flatnonzero(rises[1:] != rises[:-1]), len(v) - 1)
+    rises, ends, lengths = strokes or strokes_of(v)
     many = isinstance(gap, np.ndarray)
     lower, upper = (np.minimum, np.maximum) if many else (min, max)
     first = float(v[0])
     held, at_turns = lower(upper(before, first), first + gap), []
-    for value, rising in zip(v[turns].tolist(), rises[turns].tolist(), strict=True):
+    for value, rising in ends:
         at_turns.append(held)
         held = upper(held, value) if rising else lower(held, value + gap)
-    p = np.repeat(np.array(at_turns).T, np.diff(turns, prepend=-1), axis=-1)
+    p = np.repeat(np.array(at_turns).T, lengths, axis=-1)
     wide = gap[:, None] if isinstance(gap, np.ndarray) else gap
     return np.where(rises, np.maximum(p, v), np.minimum(p, v + wide))
 
