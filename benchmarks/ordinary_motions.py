@@ -152,8 +152,9 @@ class Case:
 class Result:
     """What came of one run; errors are those of c_r or c_l, the worse one.
 
-    learned: reversals that reached the load, until the first sample that is *tracking* with at most
-    1 % of the gap of error; first: until the first *tracking*; None for never.
+    reversals: those that reached the load. learned: as many until the first sample that is
+    *tracking* with at most 1 % of the gap of error; first: until the first *tracking*; None for
+    never.
     at_five: error at five periods (ten reversals, or the end), in gaps; std_five: its published
     deviation in gaps, None without one. Of the *tracking* samples, None without any: rms: RMS of
     error over deviation, no larger than ten; beyond: share with more than five deviations; wrong:
@@ -164,6 +165,7 @@ class Result:
     plant: str
     rate: float
     seed: int
+    reversals: int = 0
     learned: int | None = None
     first: int | None = None
     at_five: float = 1e9
@@ -180,7 +182,7 @@ class Result:
         honest = self.std_five is not None and self.std_five < 0.03 \
             and self.at_five <= 3.0 * self.std_five
         found = {
-            'never tracking': self.first is None,
+            'never tracking': self.first is None and self.reversals > IN_TIME,
             'late': self.first is not None and self.first > IN_TIME,
             'far': self.first is not None and self.at_five > CLOSE and not honest,
             'beyond five deviations': (self.beyond or 0.0) > 0.02, 'wrong': bool(self.wrong),
@@ -274,7 +276,7 @@ def run_case(case: Case) -> Result:
         return int(reversals[np.argmax(rows)]) if rows.any() else None
 
     return Result(
-        *key, first(run.tracking & (run.error <= FAR)), first(run.tracking),
+        *key, int(reversals[-1]), first(run.tracking & (run.error <= FAR)), first(run.tracking),
         float(run.error[five]), std if np.isfinite(std) else None, run.rms, run.beyond,
         run.wrong_if_tracking,
         {word.word: float(np.mean(run.status == word)) for word in Status},

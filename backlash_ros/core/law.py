@@ -39,7 +39,7 @@ class LawReport:
     coasts: bool = False  # whether the load coasts in the gap, which spoils estimates
     unconfirmed: bool = False  # whether samples have yet to confirm an earlier estimate
     wrong_sign: bool = False  # whether y moves against v, so that there is no estimate
-    undecided: bool = False  # whether several gaps explain y alike, so that there is none
+    reversals: float = nan  # of the load, by a fit that does not yet count as known
     forbidden: OutOfBounds | None = None  # bound that keeps a good estimate from being published
     waiting: int = 0  # samples that no fit includes yet
     overdue: int = 0  # samples since the fit under way was due

@@ -23,6 +23,7 @@ AGAIN_S = 10.0  # before the same cause is logged once more
 LONGEST_TEXT = 99  # `ros2 topic echo` cuts off at 128, and a terminal line holds more besides
 # Fraction of late, lost or bad samples above which they are a finding.
 TROUBLE = 0.01
+ENOUGH_REVERSALS = 6  # of the load, that tell its gap unless several explain y
 BEHIND_S = 10.0  # delay of a fit that is a finding: its process may pause, but not for so long
 UNNAMED = 'a node without a name'
 SKEW = 0.5  # of a period from stamp to arrival: only a wrong clock or a slow network takes as long
@@ -352,8 +353,10 @@ def state_beside(causes: set[str], f: LoopFigures) -> Finding:
         ('bound', warn, law.forbidden is not None and status == Status.ACQUIRING,
          f'{name} is {value:.4g}, beyond estimator.bounds.{name} [{low:g}, {high:g}]: widen it'
          + (', or correct the zero of y' if name != 'm' else '')),
-        ('undecided', ok, law.undecided and status == Status.ACQUIRING,
+        ('undecided', ok, status == Status.ACQUIRING and law.reversals >= ENOUGH_REVERSALS,
          'learning: several gaps explain y equally well: move v between more than two values'),
+        ('one way', ok, status == Status.ACQUIRING and law.reversals == 0.0,
+         'learning: v has moved the load one way only so far: swing it past the gap'),
         ('acquiring', ok, status == Status.ACQUIRING, 'learning: the estimates still move freely'),
         ('learned', ok, status == Status.TRACKING, 'learned: the estimates agree with the data'),
         ('not excited', warn, status == Status.NOT_EXCITED,

@@ -25,6 +25,7 @@ from scipy.special import chdtri
 
 from backlash_ros.core import Parameters, Status, build_closed_loop
 from backlash_ros.core.control.controller import Limits
+from backlash_ros.core.loop.diagnosis import ENOUGH_REVERSALS
 from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.tools.config import read_configuration
 
@@ -122,7 +123,14 @@ def test_two_values_of_v_leave_open_whether_slope_or_gap_is_larger() -> None:
     loop = build_closed_loop(p)
     run = loop.run(1600)
     assert not (run.column('status') == Status.TRACKING).any()
-    assert loop.controller.estimator.report.undecided
+    assert loop.controller.estimator.report.reversals >= ENOUGH_REVERSALS
+
+
+def test_load_that_v_moves_one_way_only_has_not_turned():
+    p = Parameters({**motor(), 'amplitude': 0.05, 'seed': 1})
+    loop = build_closed_loop(p)
+    loop.run(1000)
+    assert loop.controller.estimator.report.reversals == 0
 
 
 @pytest.mark.parametrize(('name', 'value', 'bound'), [

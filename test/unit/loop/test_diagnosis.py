@@ -10,6 +10,7 @@ import pytest
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.law import LawReport, OutOfBounds
 from backlash_ros.core.loop.diagnosis import (
+    ENOUGH_REVERSALS,
     LONGEST_TEXT,
     UNNAMED,
     Finding,
@@ -151,6 +152,16 @@ def test_estimates_of_before_that_hold_are_not_said_to_move() -> None:
     assert first(replace(WELL, law=LawReport(unconfirmed=True))) == LEARNED
     assert first(replace(acquiring, law=LawReport(unconfirmed=True), adapting=False)).kind == \
         'adaptation off'
+
+
+@pytest.mark.parametrize(('reversals', 'kind'), [
+    (nan, 'acquiring'), (0, 'one way'), (1, 'acquiring'), (ENOUGH_REVERSALS, 'undecided')])
+def test_motion_that_cannot_tell_the_gap_is_named(reversals, kind):
+    law = LawReport(reversals=reversals)
+    finding = first(replace(WELL, status=Status.ACQUIRING, law=law))
+    assert finding.kind == kind
+    assert len(finding.text) <= LONGEST_TEXT
+    assert first(replace(WELL, law=law)) == LEARNED
 
 
 @pytest.mark.parametrize(('changes', 'text'), [
