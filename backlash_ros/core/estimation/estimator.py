@@ -134,8 +134,7 @@ class MovingHorizon(Law):
             unexplained=nan if fit is None else fit.unexplained, coasts=belief.coasts,
             unconfirmed=belief.inherited is not None and belief.fit is None,
             wrong_sign=found is not None and setup.moves_against(found),
-            reversals=nan if found is None or belief.published or found.m <= 0.0
-            else found.left.turns,
+            reversals=nan if belief.published or not found or found.m <= 0.0 else found.left.turns,
             forbidden=outside[0] if outside else None,
             waiting=self._record.end - belief.end, outliers=self._following.outliers,
             overdue=max(self._record.end - belief.next_at, 0) if self._channel.busy else 0,

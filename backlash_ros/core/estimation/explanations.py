@@ -200,7 +200,7 @@ def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]
     likeliest, widest = p.log_posterior(best, weights), 2.0 * float(np.ptp(p.v))
     widths, sides = list[float](), list[Array]()
     for away in (-3.0, 3.0):
-        wider, nearer, beside, there = none, 0.0, None, best
+        wider, nearer, beside, last, there = none, 0.0, None, best, best
         for reach in away * 3.0 ** np.arange(6.0):
             gap = best.gap + reach * std
             if not 0.0 < gap < widest:
@@ -208,7 +208,8 @@ def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]
             normal = likeliest - 0.5 * reach**2
             # After many reversals a likelihood that falls like a normal one goes on like that.
             close = 0.1 * reach**2 if best.left.turns >= settings.HELD_REVERSALS else 0.0
-            value, there = _with_gap(p, there, gap, weights, normal, close)
+            near = p.towards(last, there, (gap - last.gap) / (there.gap - last.gap or 1.0))
+            last, (value, there) = there, _with_gap(p, near, gap, weights, normal, close)
             if not there.m > 0.0 or abs(value - normal) < close:
                 break
             behind = max(likeliest - value, 1.0)

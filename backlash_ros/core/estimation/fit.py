@@ -246,25 +246,25 @@ class Problem:
         self, f: WindowFit, best: float, w: Array, most_scale: float, held: bool, begun: bool,
     ) -> tuple[WindowFit, WindowFit, float]:
         new = self.step(f, most_scale, held, begun)
-        there = self._towards(f, new)
+        there = self.towards(f, new)
         value = self.log_posterior(there, w)
         if -inf < value <= best - 0.5:
             # Beyond a kink, where the other side is engaged, a second step may succeed.
             with suppress(np.linalg.LinAlgError):
-                again = self._towards(there, self.step(there, most_scale, held, begun))
+                again = self.towards(there, self.step(there, most_scale, held, begun))
                 of_again = self.log_posterior(again, w)
                 if of_again > best:
                     there, value = again, of_again
         length = 1.0
         while not value > best - 0.5 and length > 0.05:
             length *= 0.3
-            there = self._towards(f, new, length)
+            there = self.towards(f, new, length)
             if length > 0.2:  # the first of these: another xi needs another X, which is linear in y
                 there = self.begun(there)
             value = self.log_posterior(there, w)
         return new, there, value
 
-    def _towards(self, f: WindowFit, new: WindowFit, share: float = 1.0) -> WindowFit:
+    def towards(self, f: WindowFit, new: WindowFit, share: float = 1.0) -> WindowFit:
         furthest = float(np.abs(new.theta[3:] - f.theta[3:]).max(initial=0.0))
         length = share * (2.0 / max(furthest, 2.0))  # xi: two prior deviations a step, at most
         order, knots = max(len(f.x), len(new.x)), self._walk_of(f)[1]

@@ -150,9 +150,8 @@ class WindowFit:
     @property
     def prior_of_xi(self) -> Prior:
         """Its posterior of xi alone, as the prior of another fit."""
-        count = len(self.theta) - 3
-        root = np.linalg.inv(np.linalg.cholesky(self.cov_xi + 1e-12 * np.eye(count)))
-        return Prior(np.hstack([np.zeros((count, 3)), root]), root @ self.theta[3:])
+        root = np.linalg.inv(np.linalg.cholesky(self.cov_xi + 1e-12 * np.eye(len(self.cov_xi))))
+        return Prior(np.hstack([np.zeros((len(root), 3)), root]), root @ self.theta[3:])
 
     def behind(self, xi: Array) -> float:
         """Log-likelihood by which another xi (K,) is worse than that of this fit."""
