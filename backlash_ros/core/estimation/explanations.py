@@ -208,6 +208,7 @@ def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]
             normal = likeliest - 0.5 * reach**2
             # After many reversals a likelihood that falls like a normal one goes on like that.
             close = 0.1 * reach**2 if best.left.turns >= settings.HELD_REVERSALS else 0.0
+            # Continuation: from where the last two points lead, as p0 and o change with the gap.
             near = p.towards(last, there, (gap - last.gap) / (there.gap - last.gap or 1.0))
             last, (value, there) = there, _with_gap(p, near, gap, weights, normal, close)
             if not there.m > 0.0 or abs(value - normal) < close:

@@ -154,7 +154,8 @@ def test_a_bound_that_keeps_a_good_estimate_back_is_named_with_what_was_found(na
 # rounding of samples that were dropped, and explain y by plays that begin in different places, or
 # by two gaps, of which one was only fitted to readings without their rounding. Of few readings,
 # hardly more are near an edge of their interval than there are unknowns. In a fast motion, no two
-# readings may be a single step apart. One poor fit of few reversals blames nothing.
+# readings may be a single step apart. One poor fit of few reversals blames nothing. Where only one
+# side has been engaged, wider gaps are as likely, but take another p0 and another o.
 @pytest.mark.parametrize(('what', 'more'), [
     ('sine 0.5 rad/s; G known', {}), ('sine 0.2 rad/s; exact', {}),
     ('triangle 1.2 rad/s, swing 1.5', {}), ('moves 18 rad/s, swing 1.4', {}),
@@ -164,10 +165,11 @@ def test_a_bound_that_keeps_a_good_estimate_back_is_named_with_what_was_found(na
     ('triangle 1 rad/s; ω × 1.15; 50 Hz, seed 8', {}),
     ('moves, rests 0.5 to 1.5 s; ω × 1.15; 50 Hz, seed 12', {}),
     ('triangle 3.9 rad/s, swing 1.4; extra_lag 0.0038', {}),
+    ('moves 1.2 rad/s, swing 1.7', {}),
 ])
 def test_a_usual_motion_is_never_tracked_wrongly_and_blames_nothing(what, more):
-    drawn = (case for seed in (909, 5001, 15001, 16001, 33001, 51001)
-             for case in random_cases(130, seed, 12_000))
+    drawn = (case for seed in (909, 5001, 15001, 16001, 33001, 51001, 52001)
+             for case in random_cases(160, seed, 12_000))
     case = next(one for one in (*all_cases([3, 8, 12]), *drawn)
                 if f'{one.name}, seed {one.seed}'.startswith(what))
     assert run_case(replace(case, differs={**case.differs, **more})).faults == []
