@@ -17,11 +17,18 @@ from backlash_ros.core.control.tracking.design import (
     modulus_margin,
     preview_gains,
 )
-from backlash_ros.core.control.tracking.feedback import SHORT, Mode, Rest, shrunk_crossings
+from backlash_ros.core.control.tracking.feedback import (
+    SETTLING,
+    SHORT,
+    Mode,
+    Rest,
+    shrunk_crossings,
+)
 from backlash_ros.core.control.tracking.trajectory import IdealTrajectory
 from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import TrackingWeights
+from backlash_ros.core.plant.backlash import RIGHT
 from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
 from backlash_ros.core.scenario import ReferenceSignal
 from backlash_ros.core.simulation import run_record
@@ -146,6 +153,26 @@ def test_a_step_to_rest_stops_short_of_the_u_at_rest_by_what_is_uncertain() -> N
     known = resting(std=0.001)[2]
     rest.step(known, plan, 0.0, inverse, begins=False)
     assert stepped(rest, inverse, known) == pytest.approx(-1.0 + SHORT * 0.001)
+
+
+def test_a_step_at_rest_that_throws_a_coasting_load_further_off_is_not_repeated() -> None:
+    rest, noise = Rest(), 1e-3
+    model = StateModel(TransferFunction([0.1], [1.0, -1.9, 0.9]))
+    plan = IdealTrajectory(design(model, TrackingWeights(10, 1e-2, 0.0)))
+
+    def mode(deviation: float) -> Mode:
+        return rest.decide(0.0, noise, plan, [deviation, 0.0], 0.0, RIGHT, lambda x: -x[0], False)
+
+    assert mode(10.0 * noise) is Mode.LEAD_BACK
+    for _ in range(10):
+        assert mode(-20.0 * noise) is Mode.HOLD
+    plan.spread = 1.0
+    assert mode(0.0) is Mode.FOLLOW
+    plan.spread = 0.0
+    assert mode(20.0 * noise) is Mode.HOLD, 'as much is tolerated after the next motion, too'
+    for _ in range(SETTLING):
+        assert mode(0.0) is Mode.HOLD
+    assert mode(30.0 * noise) is Mode.LEAD_BACK, 'once y has been held close, it is again'
 
 
 def stepped(rest: Rest, inverse: BacklashInverse, estimate: Estimate) -> float:

@@ -280,7 +280,9 @@ class Rest:
     leads: int = 0  # how often gentle steps have
     turns: int = 0  # of v since full feedback began
     near: int = 0  # samples for which y has been within the tolerance
-    pull: float = 0.0  # u - u* with which LEAD_BACK began
+    pull: float = 0.0  # u - u* with which the newest LEAD_BACK began, 0 once y stays close
+    off: float = 0.0  # |x_hat - x*| with which it began
+    thrown: float = 0.0  # |x_hat - x*| that one has led to; tolerated until y stays close without
 
     def decide(
         self, y: float, noise_std: float, plan: IdealTrajectory, deviation: Sequence[float],
@@ -296,7 +298,8 @@ class Rest:
         least = 1e-5 * self.largest  # smallest tolerance
         still = 0.004 * max(TOLERANCE * noise_std, least)  # motion of x* per sample within a rest
         if plan.spread > noise_std or (self.mode is Mode.FOLLOW and plan.moved > still):
-            self.mode, self.rested, self.returns, self.leads = Mode.FOLLOW, 0, 0, 0
+            self.mode, self.rested, self.near = Mode.FOLLOW, 0, 0
+            self.returns = self.leads = 0
         elif x_std is None:
             off = abs(y - plan.references.window.item(0)) > OFF * noise_std
             self.mode = Mode.RETURN if off else Mode.HOLD
@@ -304,11 +307,19 @@ class Rest:
             self.rested += 1
             width = CLOSE if self.rested < SETTLING else TOLERANCE
             # If y has left again each time, the estimate is too poor to hold it closer.
-            width *= 2.0 ** min(max(self.leads - MOST_RETURNS, 0), 10)
-            self.limit = max(width * noise_std, least, UNCERTAIN * x_std)
+            wider = 2.0 ** min(max(self.leads - MOST_RETURNS, 0), 10)
+            narrow = max(width * noise_std, least, UNCERTAIN * x_std)
+            self.limit = max(width * wider * noise_std, narrow, self.thrown)
             if self.mode is Mode.RETURN and side is not self.side:
                 self.turns += 1
             size, pull = hypot(*deviation), pull_back(deviation)
+            self.near = self.near + 1 if size <= self.limit else 0
+            if self.near >= SETTLING:
+                self.returns = self.leads = 0
+                if self.mode is Mode.HOLD:
+                    self.pull = 0.0
+                if size <= narrow:
+                    self.thrown = 0.0
             self.mode = self._mode_at_rest(size, len(plan.x), pull, acts)
         self.side = side
         return self.mode
@@ -316,9 +327,6 @@ class Rest:
     def _mode_at_rest(self, size: float, order: int, pull: float, acts: bool) -> Mode:
         # Crossing the gap takes time, so that full feedback that keeps turning overshoots. After
         # MOST_RETURNS it is allowed again only once y has stayed within the tolerance for a while.
-        self.near = self.near + 1 if size <= self.limit else 0
-        if self.near >= SETTLING:
-            self.returns = self.leads = 0
         returns = self.mode is Mode.RETURN
         if self.turns <= order if returns else self.returns < MOST_RETURNS:
             goes_on = not self.mode.steps and acts and size > ARRIVED * self.limit
@@ -332,7 +340,10 @@ class Rest:
             return Mode.LEAD_BACK if pull * self.pull > least * self.pull**2 else Mode.HOLD
         if size <= self.limit:
             return Mode.HOLD
-        self.pull, self.leads = pull, self.leads + 1
+        if pull * self.pull < 0.0 and size > self.off:
+            self.thrown = size  # by the step before, as if the load coasts: no more of them
+            return Mode.HOLD
+        self.pull, self.off, self.leads = pull, size, self.leads + 1
         return Mode.LEAD_BACK
 
     def step(
