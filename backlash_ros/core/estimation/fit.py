@@ -265,6 +265,7 @@ class Problem:
         return new, there, value
 
     def towards(self, f: WindowFit, new: WindowFit, share: float = 1.0) -> WindowFit:
+        """The fit at this share of the way from f to new, or beyond it."""
         furthest = float(np.abs(new.theta[3:] - f.theta[3:]).max(initial=0.0))
         length = share * (2.0 / max(furthest, 2.0))  # xi: two prior deviations a step, at most
         order, knots = max(len(f.x), len(new.x)), self._walk_of(f)[1]

@@ -111,9 +111,8 @@ class PlantFamily:
 @lru_cache(maxsize=64)  # of the derivatives by xi, only those by poles change them
 def _stable(pairs: int, *logs: complex) -> tuple[complex, ...]:
     """Denominator of the poles that depend on xi, given logs of their parameters."""
-    a = [1.0 + 0j]
-    for log_omega, log_damping in zip(logs[:2 * pairs:2], logs[1:2 * pairs:2], strict=True):
-        omega, damping = exp(log_omega), exp(log_damping)
+    values, a = list(map(exp, logs)), [1.0 + 0j]
+    for omega, damping in zip(values[:2 * pairs:2], values[1:2 * pairs:2], strict=True):
         r, square = exp(-omega * damping), omega * omega * (1.0 - damping * damping)
         a = multiplied(a, [1.0, -2.0 * r * cos(sqrt(square)), r * r])
-    return tuple(multiplied(a, *([1.0, -exp(-exp(value))] for value in logs[2 * pairs:])))
+    return tuple(multiplied(a, *([1.0, -exp(-rate)] for rate in values[2 * pairs:])))

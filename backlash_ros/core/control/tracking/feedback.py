@@ -280,9 +280,9 @@ class Rest:
     leads: int = 0  # how often gentle steps have
     turns: int = 0  # of v since full feedback began
     near: int = 0  # samples for which y has been within the tolerance
-    pull: float = 0.0  # u - u* with which the newest LEAD_BACK began, 0 once y stays close
+    pull: float = 0.0  # u - u* with which the newest LEAD_BACK began, 0 once y has stayed near
     off: float = 0.0  # |x_hat - x*| with which it began
-    thrown: float = 0.0  # |x_hat - x*| that one has led to; tolerated until y stays close without
+    thrown: float = 0.0  # larger one that it led to: tolerated until y stays near without steps
 
     def decide(
         self, y: float, noise_std: float, plan: IdealTrajectory, deviation: Sequence[float],
@@ -313,20 +313,25 @@ class Rest:
             if self.mode is Mode.RETURN and side is not self.side:
                 self.turns += 1
             size, pull = hypot(*deviation), pull_back(deviation)
-            self.near = self.near + 1 if size <= self.limit else 0
-            if self.near >= SETTLING:
-                self.returns = self.leads = 0
-                if self.mode is Mode.HOLD:
-                    self.pull = 0.0
-                if size <= narrow:
-                    self.thrown = 0.0
+            self._forget(size, narrow)
             self.mode = self._mode_at_rest(size, len(plan.x), pull, acts)
         self.side = side
         return self.mode
 
+    def _forget(self, size: float, narrow: float) -> None:
+        """Forget what did not bring y back, once y has stayed within the tolerance for a while."""
+        self.near = self.near + 1 if size <= self.limit else 0
+        if self.near < SETTLING:
+            return
+        self.returns = self.leads = 0
+        if self.mode is Mode.HOLD:
+            self.pull = 0.0
+        if size <= narrow:
+            self.thrown = 0.0
+
     def _mode_at_rest(self, size: float, order: int, pull: float, acts: bool) -> Mode:
-        # Crossing the gap takes time, so that full feedback that keeps turning overshoots. After
-        # MOST_RETURNS it is allowed again only once y has stayed within the tolerance for a while.
+        # Crossing the gap takes time, so that full feedback that keeps turning overshoots: after
+        # MOST_RETURNS it is no longer allowed.
         returns = self.mode is Mode.RETURN
         if self.turns <= order if returns else self.returns < MOST_RETURNS:
             goes_on = not self.mode.steps and acts and size > ARRIVED * self.limit
