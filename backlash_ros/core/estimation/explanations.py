@@ -177,7 +177,7 @@ def _begun_elsewhere(p: Problem, best: WindowFit) -> list[WindowFit]:
     if best.left.turns >= settings.HELD_REVERSALS or not isnan(p.older.v) or not best.valid:
         return fits  # many reversals leave a single one
     begins = np.append(best.p0, p.v[0] + best.gap * np.arange(5.0) / 4.0)
-    moved = play(p.v, np.full(len(begins), best.gap), begins) != begins[:, None]
+    moved = play(p.v, np.full(len(begins), best.gap), begins, p.strokes) != begins[:, None]
     stroke = np.repeat(np.arange(len(p.strokes.ends)), p.strokes.lengths)
     first = np.unique(stroke[moved.argmax(axis=1)], return_index=True)[1]
     with suppress(np.linalg.LinAlgError):

@@ -317,7 +317,7 @@ class Problem:
             return f
         best = np.linalg.lstsq(rows[:, :-1], rows[:, -1], rcond=1e-12)[0]
         theta = f.theta.copy()
-        theta[1] += best[len(run.a) - 1:].sum()  # of nothing, unless `offset`
+        theta[1] += best[-1] if offset else 0.0
         return replace(f, x=best[:len(run.a) - 1], theta=theta)
 
     def with_intervals(self, f: WindowFit) -> WindowFit:

@@ -281,7 +281,7 @@ class Rest:
     turns: int = 0  # of v since full feedback began
     near: int = 0  # samples for which y has been within the tolerance
     pull: float = 0.0  # u - u* with which the newest LEAD_BACK began, 0 once y has stayed near
-    off: float = 0.0  # |x_hat - x*| with which it began
+    began_at: float = 0.0  # |x_hat - x*| with which it did
     thrown: float = 0.0  # larger one that it led to: tolerated until y stays near without steps
 
     def decide(
@@ -345,10 +345,10 @@ class Rest:
             return Mode.LEAD_BACK if pull * self.pull > least * self.pull**2 else Mode.HOLD
         if size <= self.limit:
             return Mode.HOLD
-        if pull * self.pull < 0.0 and size > self.off:
+        if pull * self.pull < 0.0 and size > self.began_at:
             self.thrown = size  # by the step before, as if the load coasts: no more of them
             return Mode.HOLD
-        self.pull, self.off, self.leads = pull, size, self.leads + 1
+        self.pull, self.began_at, self.leads = pull, size, self.leads + 1
         return Mode.LEAD_BACK
 
     def step(
