@@ -11,6 +11,13 @@ DONE, FAILED, BAD_INPUT = 0, 1, 2  # exit codes
 DEFAULT_CONFIG = 'paper_example.yaml'
 
 
+def use_one_thread() -> None:
+    """Keep linear algebra to one thread, unless the user asks for more; call before numpy loads."""
+    # Matrices are tiny: more threads make a fit slower, and take processors from other processes.
+    names = 'OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'
+    os.environ.update({**dict.fromkeys(names, '1'), **os.environ})
+
+
 class OptionParser(argparse.ArgumentParser):
     """A parser that ends the process with a single line if an option is wrong."""
 

@@ -5,6 +5,9 @@ import signal
 import sys
 
 from backlash_ros.middleware import ROS_MISSING, ros_is_missing
+from backlash_ros.options import use_one_thread
+
+use_one_thread()
 
 # With -m, sys.argv[0] is '-m' until the module is found; else it is the installed script.
 if sys.argv and os.path.basename(sys.argv[0]) in (

@@ -98,7 +98,6 @@ def run_jobs(
 
 
 def _in_processes(jobs: Sequence[Job], workers: int) -> Iterator[Outcome]:
-    os.environ.update(cli.ONE_THREAD)  # read when a worker imports numpy
     executor = ProcessPoolExecutor(
         workers, multiprocessing.get_context('spawn'), initializer=end_with_parent)
     try:

@@ -15,8 +15,6 @@ from backlash_ros.options import BAD_INPUT, DONE, FAILED
 from backlash_ros.tools.records.columns import parse_columns
 
 NOTHING = '–'  # stands in tables for a missing number
-# Matrices are tiny: more threads would only take processors from other processes.
-ONE_THREAD = dict.fromkeys(('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'), '1')
 
 
 class InputError(ValueError):

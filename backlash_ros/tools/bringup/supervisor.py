@@ -22,7 +22,7 @@ from typing import Any
 
 import backlash_ros
 from backlash_ros.middleware import prefer_loopback
-from backlash_ros.tools.cli import ONE_THREAD, BrokenOffError
+from backlash_ros.tools.cli import BrokenOffError
 
 # SIGINT ends a node as Ctrl-C does; a recorder may need a while to close a large bag.
 ESCALATION = ((signal.SIGINT, 10.0), (signal.SIGTERM, 3.0), (signal.SIGKILL, 3.0))
@@ -32,8 +32,8 @@ def child_environment(log_folder: Path, domain: int | str) -> dict[str, str]:
     """Environment of nodes on this machine; the user's settings stay, except for the domain."""
     environment = {
         'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', 'ROS_LOG_DIR': str(log_folder / 'ros'),
-        **ONE_THREAD, **with_source(os.environ), 'BACKLASH_ROS_EVENTS': '1',
-        'PYTHONUNBUFFERED': '1', 'ROS_DOMAIN_ID': str(domain)}
+        **with_source(os.environ), 'BACKLASH_ROS_EVENTS': '1', 'PYTHONUNBUFFERED': '1',
+        'ROS_DOMAIN_ID': str(domain)}
     prefer_loopback(environment)  # for drivers; the nodes of this package do so themselves
     return environment
 

@@ -1,7 +1,6 @@
 """`identify`: make a checked parameter file from a record of v and y, or by moving an actuator."""
 
 import argparse
-import os
 import sys
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -9,7 +8,7 @@ from pathlib import Path
 
 from backlash_ros.core.parameters import Value
 from backlash_ros.options import DONE, FAILED, OptionParser, add_motion_options, positive
-from backlash_ros.tools.cli import ONE_THREAD, add_options, run_tool, span_of
+from backlash_ros.tools.cli import add_options, run_tool, span_of
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -65,7 +64,6 @@ def share(text: str) -> float:
 
 
 def _identify(args: Sequence[str] | None) -> int:
-    os.environ.update({**ONE_THREAD, **os.environ})
     parser = make_parser()
     arguments = list(sys.argv[1:] if args is None else args)
     # Topics can be remapped, as for every node.

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import ast
 import inspect
+import os
 import re
+import subprocess
+import sys
 import xml.etree.ElementTree as ElementTree
 from collections import defaultdict
 from collections.abc import Iterator
@@ -26,6 +29,34 @@ def test_launch_file_names_executables_that_are_installed() -> None:
         ast.literal_eval(call.args[0]) for call in ast.walk(tree)
         if isinstance(call, ast.Call) and ast.unparse(call.func) == 'node'}
     assert launched == {'controller', 'reference', 'recorder', 'plant'}
+
+
+SEEN_BY_NUMPY = """
+import importlib, os, sys
+class Watch:  # of the moment at which numpy begins to be loaded
+    def find_spec(self, name, path=None, target=None):
+        if name == 'numpy' and not seen:
+            seen.append(os.environ.get('OMP_NUM_THREADS'))
+seen = []
+sys.meta_path.insert(0, Watch())
+importlib.import_module(sys.argv[1])
+importlib.import_module('numpy')
+print(*seen)
+"""
+
+
+@pytest.mark.parametrize(('given', 'seen'), [(None, '1'), ('3', '3')])
+@pytest.mark.parametrize('module', [
+    'backlash_ros.nodes.controller', 'backlash_ros.tools.simulate',
+    'backlash_ros.tools.identify.command'])
+def test_linear_algebra_has_one_thread_unless_the_user_wants_more(
+    module: str, given: str | None, seen: str,
+) -> None:
+    environment = {name: value for name, value in os.environ.items() if name != 'OMP_NUM_THREADS'}
+    environment |= {} if given is None else {'OMP_NUM_THREADS': given}
+    done = subprocess.run([sys.executable, '-c', SEEN_BY_NUMPY, module], cwd=ROOT, text=True,
+                          env=environment, capture_output=True, check=True)
+    assert done.stdout.split() == [seen]
 
 
 def test_package_xml_names_every_imported_ros_package() -> None:
