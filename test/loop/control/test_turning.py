@@ -133,6 +133,44 @@ def test_no_noise_of_y_hides_a_turn_beside_which_the_gap_is_small() -> None:
     assert trajectory.turning.side is Region.RIGHT
 
 
+AXIS = design(StateModel(TransferFunction([0.456, 0.235], [1.0, -0.475, 0.166])),
+              TrackingWeights(60, 1e-2, 0.0))
+
+
+@pytest.mark.parametrize(('gap', 'crossing', 'stays'), [
+    (0.04, 2.0, True),  # at the end u* comes back by 4 % of the gap
+    (0.01, 2.0, True),  # by 17 %, but sooner than v could go there and come back
+    (0.01, 0.2, False),  # v can follow
+    (1e-4, 2.0, False),  # by many gaps
+])
+def test_a_move_ends_without_a_turn_that_is_not_worth_two_crossings(
+    gap: float, crossing: float, stays: bool,
+) -> None:
+    trajectory, sides = IdealTrajectory(AXIS), ''
+    trajectory.begin(0.0)
+    there = np.minimum(0.004 * np.arange(200), 0.4)
+    for r in np.append(there, there[::-1]):
+        trajectory.take(r)
+        if trajectory.turn(1e-6, gap, 0.0, crossing):
+            sides += trajectory.turning.side.name[0]
+        trajectory.prepare()
+    # The first L: u* swings a little before it moves.
+    assert (sides == 'LRL') is stays
+
+
+def test_v_goes_no_further_than_where_it_stays_at_the_end_of_a_move() -> None:
+    trajectory, ideal, aims = IdealTrajectory(AXIS), [0.0], [0.0]
+    trajectory.begin(0.0)
+    for r in np.minimum(0.004 * np.arange(200), 0.4):
+        trajectory.take(r)
+        trajectory.turn(1e-6, 0.04, 0.0, 2.0)
+        ideal.append(trajectory.u)
+        aims.append(trajectory.aim)
+        trajectory.prepare()
+    assert max(ideal) > 0.401
+    assert max(aims) == pytest.approx(0.4, abs=1e-4)
+    assert np.diff(aims)[aims.index(max(aims)):].min() > -1e-9  # it does not come back
+
 def test_noise_of_the_references_asks_for_a_trajectory_that_it_moves_less() -> None:
     trajectory = IdealTrajectory(SLOW)
     trajectory.begin(0.0)

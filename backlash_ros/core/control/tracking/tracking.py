@@ -196,7 +196,9 @@ class Tracking(ControlStructure):
             return worth
         held = inverse.held_u * side
         least, most = min(worth * side, held), max(plan.turning.furthest * side, held)
-        if worth * side > most + noise:
+        if plan.turning.stays:  # what goes beyond where u* comes to rest has to come back
+            most = max(plan.aim * side, held)
+        elif worth * side > most + noise:
             most = worth * side
         elif abs(self.hand_over.added) <= noise and wanted * side > max(plan.aim * side, held):
             furthest = self.feedback.furthest(deviation, plan.ahead, side, plan.turning.turns_in)

@@ -16,6 +16,9 @@ from backlash_ros.core.plant.backlash import GAP, RIGHT, Region
 from backlash_ros.core.plant.numerics import NoiseLevel
 from backlash_ros.core.plant.transfer_function import Array, powers
 
+# Fraction of m (c_r - c_l) by which u may differ from a u* that comes to rest: a load that is met
+# while v crosses the gap is thrown further than that.
+LITTLE = 0.1
 QUIET = 0.02  # fraction of m (c_r - c_l) by which noise of the references may move u*
 
 
@@ -117,6 +120,8 @@ class Turning:
     extreme: float = nan  # furthest u* on that side so far
     furthest: float = nan  # u* to which u goes without turning
     turns_in: int = 0  # samples until u* turns; len(ahead) if it does not turn within these
+    since: int = 0  # samples since it last turned
+    stays: bool = False  # whether v stays on this side, as u* comes to rest close to it
 
 
 class IdealTrajectory:
@@ -140,8 +145,13 @@ class IdealTrajectory:
 
     @property
     def aim(self) -> float:
-        """u* of this sample, or Turning.furthest if u* goes beyond that without a turn to come."""
+        """u* of this sample, or Turning.furthest if u* goes beyond that without a turn to come.
+
+        While v stays on its side, what u* comes back is not followed.
+        """
         side, furthest = self.turning.side, self.turning.furthest
+        if self.turning.stays:
+            return min(max(self.u * side, self.turning.extreme * side), furthest * side) * side
         return furthest if side is not GAP and (self.u - furthest) * side > 0.0 else self.u
 
     @property
@@ -226,7 +236,7 @@ class IdealTrajectory:
         takes to cross the gap; it leaves as long before the turn as it arrives after it.
         """
         ahead, turning, before = self.ahead, self.turning, self.turning.side
-        taken, turns_in = ceil(crossing), 0
+        taken, turns_in, stays = ceil(crossing), 0, False
         if isnan(turning.extreme):
             turning.extreme = ahead[0]
         arrival = max(taken - 1, 0)
@@ -242,21 +252,46 @@ class IdealTrajectory:
                 turning.side = Region((first > 0.0) - (first < 0.0))
         else:
             peak = _turn(ahead, turning.extreme, before, noise, band, taken)
+            # A swing that v has begun to follow is followed to its end.
+            if (peak is not None or turning.stays) and turning.since > len(ahead):
+                stays = self._stays(gap_u, taken)
+            peak = None if stays else peak
             turns_in = len(ahead) if peak is None else max(peak, 0)
             later = ahead[min(arrival, len(ahead) - 1)]
             if peak is not None and peak < taken and (later - turning.extreme) * before <= 0.0:
                 turning.side = Region(-before)
                 turning.extreme, turning.decided = later, arrival
-        if (ahead[0] - turning.extreme) * turning.side > 0.0 and not turning.decided:
-            turning.extreme = ahead[0]
-        turning.turns_in = turns_in if turning.side is before else 0
+        turning.stays, turning.turns_in = stays, turns_in if turning.side is before else 0
         most, least_of = (max, min) if turning.side is RIGHT else (min, max)
         turning.furthest = most(ahead)
-        if turning.turns_in == len(ahead) \
-                and least_of(ahead[ahead.index(turning.furthest):]) != ahead[-1]:
+        if turning.turns_in == len(ahead) and (
+                stays or least_of(ahead[ahead.index(turning.furthest):]) != ahead[-1]):
             # A swing that is no turn and is over within `ahead` is not followed there and back.
             turning.furthest = ahead[-1]
+        newest, at_rest = self.aim if stays else ahead[0], max(ahead) - min(ahead) <= least
+        onward = (newest - turning.extreme) * turning.side > 0.0 and not turning.decided
+        if onward or (stays and at_rest):
+            turning.extreme = newest
+        turning.since = turning.since + 1 if turning.side is before else 0
         return turning.side is not before
+
+    def _stays(self, gap_u: float, taken: int) -> bool:
+        """Whether u* comes to rest on its side, and nothing before that is worth crossing the gap.
+
+        Nothing is if u, held where u* comes to rest, differs from u* by little, or by more for less
+        time than v takes there and back.
+        """
+        ahead, side, little = self.ahead, self.turning.side, LITTLE * gap_u
+        window = self.references.window
+        later = window[min(len(ahead), len(window)) - 1:]
+        rest, furthest, off = ahead[-1] * side, self.turning.extreme * side, list[int]()
+        if furthest - rest > little or float(np.ptp(later)) > self.references.noise_spread:
+            return False
+        for j, u in enumerate(ahead):
+            furthest = max(furthest, u * side)
+            if abs(u * side - min(furthest, rest)) > little:
+                off.append(j)
+        return not off or off[-1] - off[0] < 2 * taken
 
     @property
     def noise(self) -> tuple[Array, float]:
