@@ -85,6 +85,20 @@ def moves_with_rests(seed: int, count: int, rest: int) -> Array:
     return np.concatenate(asked)
 
 
+@pytest.mark.parametrize(('noise', 'more'), [(1e-4, 7), (3.65e-4, 1)])  # as configured
+def test_v_stays_on_its_side_at_the_end_of_a_move(noise: float, more: int) -> None:
+    there = np.clip(0.004 * np.arange(400), 0.0, 0.8) - 0.4
+    asked = np.concatenate([there, there[::-1]] * 3)
+    known = known_backlash(1.0, 0.021, -0.021).items()
+    v, error = moved(
+        asked, **{name.replace('.', '__'): value for name, value in known},
+        plant__numerator=[0.456, 0.235], plant__denominator=[1.0, -0.475, 0.166],
+        estimator__output_noise_std=noise, output_quantum=5e-4, control__min=-1.5,
+        control__max=1.5, control__rate_max=5.0)
+    assert turns(v, 0.021) <= turns(asked, 0.1) + more
+    assert error < 2e-4
+
+
 def test_moves_with_rests_cross_the_gap_where_they_turn() -> None:
     reference = moves_with_rests(3, 9, 400)
     v, error = moved(reference)
