@@ -268,9 +268,10 @@ class IdealTrajectory:
                 stays or least_of(ahead[ahead.index(turning.furthest):]) != ahead[-1]):
             # A swing that is no turn and is over within `ahead` is not followed there and back.
             turning.furthest = ahead[-1]
-        newest, at_rest = self.aim if stays else ahead[0], max(ahead) - min(ahead) <= least
+        newest = self.aim if stays else ahead[0]
         onward = (newest - turning.extreme) * turning.side > 0.0 and not turning.decided
-        if onward or (stays and at_rest):
+        # At rest, what is left of the swing is no reason to turn early for the next move.
+        if onward or (stays and max(ahead) - min(ahead) <= least):
             turning.extreme = newest
         turning.since = turning.since + 1 if turning.side is before else 0
         return turning.side is not before
