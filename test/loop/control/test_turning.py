@@ -185,6 +185,7 @@ def test_v_goes_no_further_than_where_it_stays_at_the_end_of_a_move() -> None:
     assert max(aims) == pytest.approx(0.4, abs=1e-4)
     assert np.diff(aims)[aims.index(max(aims)):].min() > -1e-9  # it does not come back
 
+
 def test_noise_of_the_references_asks_for_a_trajectory_that_it_moves_less() -> None:
     trajectory = IdealTrajectory(SLOW)
     trajectory.begin(0.0)

@@ -10,7 +10,7 @@ from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.structure import ControlInput, ControlStructure
 from backlash_ros.core.control.tracking.design import TrackingDesign, better_design, design
 from backlash_ros.core.control.tracking.feedback import OFF, Rest, StateFeedback, shrunk_crossings
-from backlash_ros.core.control.tracking.trajectory import LITTLE, IdealTrajectory
+from backlash_ros.core.control.tracking.trajectory import WORTH_CROSSING, IdealTrajectory
 from backlash_ros.core.law import Law
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import TrackingWeights
@@ -224,5 +224,5 @@ class Tracking(ControlStructure):
         # If feedback turned before the trajectory, the old side of u* is no reason to turn back.
         band = plan.back + (noise if side is asked else 0.0)
         if plan.turning.stays:
-            band = max(band, LITTLE * self.feedback.gap_u)
+            band = max(band, WORTH_CROSSING * self.feedback.gap_u)
         return Region(-side) if back > max(band, inverse.direction_band) else side

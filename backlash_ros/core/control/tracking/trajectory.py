@@ -16,9 +16,9 @@ from backlash_ros.core.plant.backlash import GAP, RIGHT, Region
 from backlash_ros.core.plant.numerics import NoiseLevel
 from backlash_ros.core.plant.transfer_function import Array, powers
 
-# Fraction of m (c_r - c_l) by which u may differ from a u* that comes to rest: a load that is met
-# while v crosses the gap is thrown further than that.
-LITTLE = 0.1
+# Fraction of m (c_r - c_l) by which u has to be off at the end of a move to be worth a crossing: a
+# load that v meets at full speed may be thrown as far.
+WORTH_CROSSING = 0.1
 QUIET = 0.02  # fraction of m (c_r - c_l) by which noise of the references may move u*
 
 
@@ -282,7 +282,7 @@ class IdealTrajectory:
         Nothing is if u, held where u* comes to rest, differs from u* by little, or by more for less
         time than v takes there and back.
         """
-        ahead, side, little = self.ahead, self.turning.side, LITTLE * gap_u
+        ahead, side, little = self.ahead, self.turning.side, WORTH_CROSSING * gap_u
         window = self.references.window
         later = window[min(len(ahead), len(window)) - 1:]
         rest, furthest, off = ahead[-1] * side, self.turning.extreme * side, list[int]()
