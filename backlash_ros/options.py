@@ -1,4 +1,4 @@
-"""What all command lines share: exit codes, errors in one line, types of options, shipped files."""
+"""What all command lines share: exit codes, errors in one line, options, files, one thread."""
 
 import argparse
 import os

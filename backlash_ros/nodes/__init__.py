@@ -5,9 +5,6 @@ import signal
 import sys
 
 from backlash_ros.middleware import ROS_MISSING, ros_is_missing
-from backlash_ros.options import use_one_thread
-
-use_one_thread()
 
 # With -m, sys.argv[0] is '-m' until the module is found; else it is the installed script.
 if sys.argv and os.path.basename(sys.argv[0]) in (
@@ -19,3 +16,8 @@ if sys.argv and os.path.basename(sys.argv[0]) in (
     signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT, signal.SIGTERM))
     if ros_is_missing():
         sys.exit(ROS_MISSING)
+
+# Only now: this import takes a while, too.
+from backlash_ros.options import use_one_thread
+
+use_one_thread()

@@ -283,8 +283,7 @@ class IdealTrajectory:
         time than v takes there and back.
         """
         ahead, side, little = self.ahead, self.turning.side, WORTH_CROSSING * gap_u
-        window = self.references.window
-        later = window[min(len(ahead), len(window)) - 1:]
+        later = self.references.window[len(ahead) - 1:]
         rest, furthest, off = ahead[-1] * side, self.turning.extreme * side, list[int]()
         if furthest - rest > little or float(np.ptp(later)) > self.references.noise_spread:
             return False
