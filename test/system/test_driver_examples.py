@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from bringup_processes import UNDRAWN
 from places import ROOT
+from waiting import DEADLINE_S
 
 from backlash_ros.tools.bringup.supervisor import child_environment, free_domain
 
@@ -20,7 +21,6 @@ BLOCKS = re.findall(
 FOREVER = ('motor_driver.py', 'bare_dds_driver.py', '/controller', '/reference')
 SHORT_S = {'check_driver': '2', 'bringup': '1'}  # the pages give a user more time
 NARROW = {'identify': ['--order', '1-2', '--delay', '0-1']}  # and search for more
-DEADLINE_S = 240.0
 
 
 def commands_of_driver_page() -> list[list[str]]:
