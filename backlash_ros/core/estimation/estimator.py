@@ -131,14 +131,13 @@ class MovingHorizon(Law):
         outside = setup.outside_bounds(found) if found and setup.is_precise(found) else []
         return LawReport(
             noise_ratio=nan if belief.fit is None else belief.fit.noise / setup.noise_std,
-            unexplained=nan if fit is None else fit.unexplained, coasts=belief.coasts,
-            unconfirmed=belief.inherited is not None and belief.fit is None,
-            wrong_sign=found is not None and setup.moves_against(found),
+            unexplained=nan if fit is None else fit.unexplained, reattributed=self._reattributed,
+            unconfirmed=belief.inherited is not None and (belief.holds or belief.fit is None),
+            wrong_sign=found is not None and setup.moves_against(found), coasts=belief.coasts,
             reversals=nan if belief.published or not found or found.m <= 0.0 else found.left.turns,
-            forbidden=outside[0] if outside else None,
-            waiting=self._record.end - belief.end, outliers=self._following.outliers,
+            forbidden=outside[0] if outside else None, waiting=self._record.end - belief.end,
             overdue=max(self._record.end - belief.next_at, 0) if self._channel.busy else 0,
-            reattributed=self._reattributed, failed_fits=self._failed_fits)
+            outliers=self._following.outliers, failed_fits=self._failed_fits)
 
     def response_std(self, z: NDArray[np.complex128]) -> Array:
         fit, family = self._belief.fit, self._setup.family
@@ -153,11 +152,9 @@ class MovingHorizon(Law):
         self._following.change_model(model, proposed.gains if model is proposed.model else ())
 
     def retune(self, p: Parameters) -> None:
-        root = p.sample_period**0.5
-        self._setup = replace(
-            self._setup, noise_std=max(p.estimator.output_noise_std, 1e-12),
-            walk_std=p.estimator.input_noise_std * root,
-            drift=np.array(p.estimator.drift_std) * root)
+        root, e = p.sample_period**0.5, p.estimator
+        self._setup = replace(self._setup, noise_std=max(e.output_noise_std, 1e-12),
+                              walk_std=e.input_noise_std * root, drift=np.array(e.drift_std) * root)
 
     def close(self) -> None:
         self._channel.close()
@@ -178,7 +175,7 @@ class MovingHorizon(Law):
         # within the gap is recorded: the true gap may be narrower than it seems.
         if self.adapting and (family.integrates or following.since_v_moved <= family.memory):
             self._record.append(interval.v, nan if y is None else y, interval.other)
-        status = self._belief.reason
+        status = Status.ACQUIRING if self._belief.holds else self._belief.reason
         if self._lost_in_a_row >= 20:
             status = Status.NO_DATA
         elif following.observer is not None and following.since_motion > family.memory \

@@ -203,9 +203,8 @@ class Problem:
             self._walk_of(f)[0], f.m * (side == Region.GAP), run.p, np.full(count, -1.0),
             f.m * (side == Region.LEFT), run.u, run.y, np.eye(1, count)]))
         *_, u, y, impulse = over_a
-        return np.vstack([
-            shifted(impulse, len(run.a) - 1), lfilter(run.b, [1.0], over_a[:-3]),
-            sensitivities(self.family, f.xi, u, y)]).T
+        return np.vstack([shifted(impulse, len(run.a) - 1), lfilter(run.b, [1.0], over_a[:-3]),
+                          sensitivities(self.family, f.xi, u, y)]).T
 
     def fitted(self, f: WindowFit, steps: int = STEPS, least_gain: float = 0.0) -> WindowFit:
         """Take Gauss-Newton steps from f until they converge or gain under `least_gain` nats."""

@@ -59,9 +59,8 @@ class PlantFamily:
         shorter = np.poly1d([1.0, 1.0]) ** max(len(b) - 2, 0)
         wide = np.convolve(shorter * (b.sum() / shorter(1.0)), [1.0, -2.0, 1.0])
         # B, and its derivatives by lag and width.
-        self._taps: list[list[float]] = [
-            padded(taps, max(len(b) + 1, 3)).tolist()
-            for taps in (b, np.append(0.0, b) - np.append(b, 0.0), wide)]
+        taps = b, np.append(0.0, b) - np.append(b, 0.0), wide
+        self._taps: list[list[float]] = [padded(t, max(len(b) + 1, 3)).tolist() for t in taps]
 
     def at(self, xi: list[float]) -> tuple[list[float], list[float]]:
         b, a = self._coefficients(xi)

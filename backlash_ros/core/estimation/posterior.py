@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.settings import CHANCE
-from backlash_ros.core.plant.numerics import squares_of
+from backlash_ros.core.plant.numerics import chi_square, squares_of
 from backlash_ros.core.plant.transfer_function import Array
 
 SCALES = np.asarray(np.geomspace(3e-4, 10.0, 14), np.float64)  # grid of s
@@ -35,11 +35,9 @@ class Likelihood(NamedTuple):
 def likelihood(r: Array, noise_std: float, step: float, weights: Array) -> Likelihood:
     """Likelihood of readings with residuals r and weights, both (N,); step 0: not quantized."""
     if not step:
-        return Likelihood(
-            -0.5 * (r / noise_std) ** 2 - log(sqrt(2.0 * pi) * noise_std), r / noise_std**2,
-            np.full(len(r), noise_std**-2))
-    half = 0.5 * step / noise_std
-    probability, score, curvature = _of_interval(r / noise_std, half)
+        density = -0.5 * (r / noise_std) ** 2 - log(sqrt(2.0 * pi) * noise_std)
+        return Likelihood(density, r / noise_std**2, np.full(len(r), noise_std**-2))
+    probability, score, curvature = _of_interval(r / noise_std, 0.5 * step / noise_std)
     # Each gets at least the mean information, or unknowns could stay undetermined; the sum is kept.
     total = weights @ curvature + 1e-9  # positive even if no reading says anything
     information = np.maximum(curvature, total / (weights.sum() + 1e-9))
@@ -220,9 +218,7 @@ def gap_variance(cov: Array) -> float:
 
 def agree(one: Array, other: Array, cov: Array) -> bool:
     """Whether vectors (n,) agree by a chi-square test; cov: of their difference (n, n)."""
-    from scipy.special import chdtri  # late: 31 MB that only fits need
-
-    return squares_of(one - other, cov) < float(chdtri(len(one), CHANCE))
+    return squares_of(one - other, cov) < chi_square(CHANCE, len(one))
 
 
 def error_of_plant(

@@ -67,10 +67,9 @@ def search(
         # Only motion of u depends on xi; its constant part belongs to o.
         move = lfilter([1.0], a, p - p[:, :1])
         y_over_a = lfilter([1.0], a, lfilter(b, [1.0], move))
-        columns = rest(np.concatenate([
-            averaged(lfilter(b, [1.0], lfilter([1.0], a, np.stack([p, begun], 1)))),
-            averaged(sensitivities(family, xi.tolist(), move, y_over_a)),
-        ], axis=1))
+        of_play = averaged(lfilter(b, [1.0], lfilter([1.0], a, np.stack([p, begun], 1))))
+        of_xi = averaged(sensitivities(family, xi.tolist(), move, y_over_a))
+        columns = rest(np.concatenate([of_play, of_xi], axis=1))
         target = np.broadcast_to(y_rest, (len(g), 1, len(y_rest)))
         stack = np.concatenate([columns, target], axis=1).transpose(0, 2, 1)
         r = np.asarray(np.linalg.qr(stack, mode='r'))

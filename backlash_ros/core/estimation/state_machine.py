@@ -12,6 +12,7 @@
 |           |                            |                      | enough                          |
 """
 
+from dataclasses import replace
 from math import isnan, log
 
 import numpy as np
@@ -25,8 +26,8 @@ from backlash_ros.core.estimation.fit import FEW_STEPS, Problem
 from backlash_ros.core.estimation.late_commands import likelier, weighed
 from backlash_ros.core.estimation.posterior import Prior, WindowFit, agree
 from backlash_ros.core.estimation.settings import BLOCKS, FEWEST, MISFIT, PREDICTED, SHORT_RECORD
-from backlash_ros.core.estimation.unmodelled import coasts, with_walk
-from backlash_ros.core.plant.numerics import isolated, log_density, squares_of
+from backlash_ros.core.estimation.unmodelled import as_known, coasts, with_walk
+from backlash_ros.core.plant.numerics import chi_square, isolated, log_density, squares_of
 from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.window import Window
 
@@ -44,10 +45,25 @@ def learn(setup: Setup, record: Window, before: Belief) -> Belief:
             since = record.first if thorough else before.end - setup.family.memory
             record, swapped = likelier(p, before.fit, record, since, kept.swapped)
             before = before._replace(kept=kept._replace(swapped=swapped))
-        return look[before.state](setup, record, before)
+        after = look[before.state](setup, record, before)
+        return after._replace(holds=_holds(setup, record, after))
     except np.linalg.LinAlgError:
         first = max(record.end - settings.FIRST_FIT, record.first)
         return _begun_anew(before, first, record.end, record.end + FEWEST)
+
+
+def _holds(setup: Setup, record: Window, after: Belief) -> bool:
+    """Whether what was known before the run leaves next to nothing of what contradicts the fit."""
+    fit, known = after.fit or after.found, after.inherited
+    if after.reason is not Status.INCONSISTENT or after.coasts or not known:
+        return False
+    if not fit:
+        return after.holds  # as before, until there is one again
+    problem = setup.problem(record.between(after.kept.first))
+    there = as_known(problem, known.crossings, replace(fit, knots=np.zeros(0)))
+    newest = problem.at(there).error[max((after.doubt_from or 0) - after.kept.first, 0):]
+    moves = float(np.mean(newest**2)) ** 0.5 / there.left.gain
+    return moves < settings.NEGLIGIBLE * there.m * there.gap and setup.family.count > 0
 
 
 def _begun_anew(before: Belief, first: int, end: int, next_at: int) -> Belief:
@@ -141,11 +157,9 @@ def _adopted(
         must = min(must, PREDICTED)  # another noise, or a walk, but the same backlash
     return _published(setup, before._replace(
         found=None, doubt_from=None, coasts=coasts(setup.problem(record, older), fit),
-        kept=before.kept._replace(first=record.first, older=older),
-        trial=Trial(must, 0, fit.noise),
+        kept=before.kept._replace(first=record.first, older=older), trial=Trial(must, 0, fit.noise),
         next_at=record.end + max(count // BLOCKS, FEWEST),
-        thorough=(record.end + count // 4, 0.25 * float(fit.cov[2, 2])),
-    ), fit)
+        thorough=(record.end + count // 4, 0.25 * float(fit.cov[2, 2]))), fit)
 
 
 def _known(setup: Setup, record: Window, before: Belief) -> Belief:
@@ -177,9 +191,8 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
             reason=Status.INCONSISTENT if lately else before.reason)
     # Look again soon after an early fit: what caused the surprise may have only just begun.
     soon = FEWEST if record.end < before.next_at else max(count // BLOCKS, FEWEST)
-    after = before._replace(
-        end=record.end, next_at=record.end + soon,
-        trial=trial._replace(predicted=trial.predicted + count - new))
+    trial = trial._replace(predicted=trial.predicted + count - new)
+    after = before._replace(end=record.end, next_at=record.end + soon, trial=trial)
     if record.end >= before.thorough[0] or fit.cov[2, 2] < before.thorough[1]:
         fit = problem.with_intervals(fit)
         if count <= SHORT_RECORD and isnan(problem.older.v):
@@ -187,9 +200,8 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
             found = other and setup.is_known(other, settings.REVERSALS)
             fit = other if other and found else mixed(problem, fit)
             record, fit, swapped = weighed(setup, record, fit, kept.swapped, kept.older)
-            if swapped != kept.swapped:
-                problem = setup.problem(record, kept.older)
-                after = after._replace(kept=kept._replace(swapped=swapped))
+            problem = setup.problem(record, kept.older)
+            after = after._replace(kept=kept._replace(swapped=swapped))
         elif fit.step or fit.spread.any():  # else the posterior is normal
             fit = mixed(problem, fit)
         fit = with_walk(problem, fit, setup.walk_std)
@@ -202,9 +214,7 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
     return _published(setup, *shortened(setup, record, problem, after, fit))
 
 
-def _contradicts(
-    problem: Problem, held: WindowFit, fit: WindowFit, new: int, rho: float,
-) -> bool:
+def _contradicts(problem: Problem, held: WindowFit, fit: WindowFit, new: int, rho: float) -> bool:
     """Whether the refit `fit` leaves more than the noise of the held fit: in samples from index
     `new` on, or in all, if it fits those at the cost of others. rho: correlation of residuals."""
     weights = problem.at(fit).weights
@@ -226,10 +236,8 @@ def _outliers(z: Array) -> NDArray[np.bool_]:
 
 def _most(least: float, count: float, rho: float) -> float:
     """Limit on the mean square of count normalized residuals: `least`, or what chance explains."""
-    from scipy.special import chdtri  # late: 31 MB that only fits need
-
     free = max(count / (1.0 + (count - 1.0) * rho), 1.0)
-    return max(least, float(chdtri(free, 1e-5)) / free)
+    return max(least, chi_square(1e-5, free) / free)
 
 
 def _doubted(setup: Setup, record: Window, before: Belief) -> Belief:
@@ -243,10 +251,9 @@ def _doubted(setup: Setup, record: Window, before: Belief) -> Belief:
     z = setup.problem(record, kept.older).residual(held) / held.noise
     if newer >= 2 * PREDICTED and np.nanmean(z[-PREDICTED:] ** 2) < MISFIT:
         # Whatever it was, it is over: the readings taken meanwhile are discarded.
-        lost = frozenset(range(since, record.end - PREDICTED))
-        return after._replace(
-            doubt_from=None, kept=kept._replace(rejected=kept.rejected | lost),
-            end=record.end - 1, next_at=record.end)
+        lost = kept.rejected | frozenset(range(since, record.end - PREDICTED))
+        return after._replace(doubt_from=None, end=record.end - 1, next_at=record.end,
+                              kept=kept._replace(rejected=lost))
     if newer >= PREDICTED:
         after = after._replace(reason=Status.INCONSISTENT)
     short = max(SHORT_RECORD, 4 * setup.family.memory)
@@ -295,8 +302,7 @@ def _published(setup: Setup, belief: Belief, fit: WindowFit) -> Belief:
 def _beside_inherited(setup: Setup, belief: Belief, fit: WindowFit, known: Known) -> Belief:
     # Unexplained motion may be gap as well, and the lost motion of a gear varies with its motion.
     replacing = 0.05  # std of the gap over the gap below which samples replace what was known
-    doubt = (fit.unexplained * fit.gap) ** 2 / 2.0
-    cov = fit.crossings_cov + doubt * np.diag([0.0, 1.0, 1.0])
+    cov = fit.crossings_cov + (fit.unexplained * fit.gap) ** 2 / 2.0 * np.diag([0.0, 1.0, 1.0])
     (m, c_r, c_l), apart = known.crossings, fit.crossings - known.crossings
     size = np.array([m, c_r - c_l, c_r - c_l])
     prior = known.cov + np.diag((1e-9 * size) ** 2)

@@ -27,14 +27,17 @@ def coasts(problem: Problem, fit: WindowFit, known: Array | None = None) -> bool
     matters = 2e-3  # least unexplained motion over the gap; quantization of slow motion leaves less
     if not (fit.m > 0.0 and fit.left.turns and fit.systematic and fit.unexplained > matters):
         return False
-    if known is not None:
-        m, c_r, c_l = known.tolist()
-        theta = np.concatenate([[m, m * c_r, c_r - c_l], fit.theta[3:]])
-        p0 = float(problem.v[0]) + 0.5 * (c_r - c_l)
-        there = problem.begun(replace(fit, theta=theta, p0=p0))
-        if _coasting_score(problem, problem.finished(there)) > named:
-            return True
+    if known is not None and _coasting_score(problem, as_known(problem, known, fit)) > named:
+        return True
     return _coasting_score(problem, fit) > named
+
+
+def as_known(problem: Problem, known: Array, fit: WindowFit) -> WindowFit:
+    """The fit with earlier m, c_r, c_l (3,) in place of its own."""
+    m, c_r, c_l = known.tolist()
+    theta = np.concatenate([[m, m * c_r, c_r - c_l], fit.theta[3:]])
+    p0 = float(problem.v[0]) + 0.5 * (c_r - c_l)
+    return problem.finished(problem.begun(replace(fit, theta=theta, p0=p0)))
 
 
 def _coasting_score(problem: Problem, fit: WindowFit) -> float:

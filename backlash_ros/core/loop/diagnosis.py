@@ -349,7 +349,7 @@ def state_beside(causes: set[str], f: LoopFigures) -> Finding:
         ('adaptation off', ok, not adapting and status != Status.INCONSISTENT,
          'estimates held by ~/freeze_adaptation; outputs are still answered'),
         ('known', ok, law.unconfirmed and status == Status.ACQUIRING,
-         'earlier estimates hold: only a v at several speeds can confirm them'),
+         'earlier estimates hold, not confirmed so far: move v at several speeds'),
         ('bound', warn, law.forbidden is not None and status == Status.ACQUIRING,
          f'{name} is {value:.4g}, beyond estimator.bounds.{name} [{low:g}, {high:g}]: widen it'
          + (', or correct the zero of y' if name != 'm' else '')),

@@ -337,6 +337,13 @@ def squares_of(apart: Array, cov: Array) -> float:
     return float(apart @ np.linalg.lstsq(cov, apart, rcond=1e-14)[0])
 
 
+def chi_square(probability: float, freedom: float) -> float:
+    """What chi-square of that many degrees of freedom exceeds with this probability."""
+    from scipy.special import chdtri  # where it is needed: 31 MB
+
+    return float(chdtri(freedom, probability))
+
+
 def log_density(apart: Array, cov: Array) -> float:
     """Log-density of a difference (n,) of this covariance (n, n), up to a constant."""
     return -0.5 * (squares_of(apart, cov) + float(np.linalg.slogdet(cov)[1]))

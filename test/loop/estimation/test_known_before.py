@@ -143,3 +143,18 @@ def test_friction_that_stops_the_load_is_backlash() -> None:
 def test_a_lag_that_nobody_told_of_is_no_load_that_coasts() -> None:
     estimator = moved_by_a_sine(2.0 * ACCELERATION, late=8)
     assert not estimator.report.coasts
+
+
+@pytest.mark.parametrize('share', [0.03, 0.4])
+def test_what_no_backlash_explains_contradicts_it_only_if_it_is_large(share: float) -> None:
+    """share: of the gap by which y moves besides, as by friction, in the second half."""
+    besides = share * np.sin(0.0137 * K) * (K > SAMPLES // 2)
+    estimator, rows = run(MOTIONS['multisine'][:1700], also=besides[:1700])
+    gap, _, states = rows[1250:].T
+    assert gap == pytest.approx(1.0, abs=0.02)
+    small = share < 0.1
+    assert set(states.tolist()) == {Status.ACQUIRING if small else Status.INCONSISTENT}
+    assert estimator.report.unconfirmed == small
+    # In the end newer samples alone are searched, and a walk of u is found to explain them.
+    _, rows = run(MOTIONS['multisine'], also=besides)
+    assert (Status.INCONSISTENT in rows[1250:, 2]) != small
