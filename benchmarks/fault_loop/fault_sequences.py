@@ -35,6 +35,7 @@ KINDS = {  # of what may be found
     'jumps': 'a jump at the first command after an interruption',
     'unbounded': 'u_d further from what y_m asks for than tracking.md says',
     'broken': 'an exception',
+    'failed': 'a fit without a result',
     'wrong': '*tracking* with an estimate off by more than five published deviations',
     'wrong_inherited': 'the same in a loop that began with saved estimates of another plant',
     'wrong_uncertain': 'the same where time constants of the true G differ by up to 15 %',
@@ -102,6 +103,7 @@ class Sequence:
             y_m = driver.reference(tick * PERIOD_S)
             self.controller.run(y_m if self._frozen is None else self._frozen)
         self.found['unbounded'] += self._bound.exceeded()
+        self._note_failed_fits()
         return self.found
 
     # What may happen.
@@ -129,7 +131,13 @@ class Sequence:
         self.driver.offset_ns += int(self.rng.choice([-1, 1])) * int(10 ** self.rng.uniform(6, 10))
         self._freeze()
 
+    def _note_failed_fits(self) -> None:
+        failed = self.controller.loop.core.estimator.report.failed_fits
+        if failed:
+            self.found['failed'].append(f'sample {self.driver.tick}: {failed} fits')
+
     def _restart_controller(self, tick: int) -> None:
+        self._note_failed_fits()
         rng, controller = self.rng, self.controller
         if rng.random() < 0.5:
             controller.deactivate()

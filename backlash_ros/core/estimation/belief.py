@@ -64,7 +64,7 @@ class Belief(NamedTuple):
     inherited: Known | None = None  # estimate from before the run
     reason: Status = Status.ACQUIRING  # status of what is published
     coasts: bool = False  # whether the load coasts in the gap
-    holds: bool = False  # whether `inherited` explains the samples that the fit does not
+    holds: bool = False  # whether what is published explains the samples that the fit does not
 
     @property
     def state(self) -> State:

@@ -132,7 +132,7 @@ class MovingHorizon(Law):
         return LawReport(
             noise_ratio=nan if belief.fit is None else belief.fit.noise / setup.noise_std,
             unexplained=nan if fit is None else fit.unexplained, reattributed=self._reattributed,
-            unconfirmed=belief.inherited is not None and (belief.holds or belief.fit is None),
+            unconfirmed=belief.holds or (belief.inherited is not None and belief.fit is None),
             wrong_sign=found is not None and setup.moves_against(found), coasts=belief.coasts,
             reversals=nan if belief.published or not found or found.m <= 0.0 else found.left.turns,
             forbidden=outside[0] if outside else None, waiting=self._record.end - belief.end,

@@ -134,10 +134,10 @@ def afresh(
     fits = sorted((f for f in fits if np.isfinite(f.evidence)), key=lambda f: -f.evidence)
     different = [f for i, f in enumerate(fits) if all(
         abs(f.gap - g.gap) >= 0.1 * sqrt(max(float(g.cov[2, 2]), 0.0)) for g in fits[:i])]
-    if not different:
-        return None
-    likely = different[0].evidence - settings.FAR_BEHIND
+    likely = different[0].evidence - settings.FAR_BEHIND if different else inf
     fits = [p.finished(p.fitted(f)) for f in different if f.evidence > likely]
+    if not fits:  # even the best one has diverged
+        return None
     best = max(fits, key=lambda f: f.evidence)
     if best.m < 0.0 or (older is None and best.left.turns < setup.turns_needed):
         return best  # not known, however precise it is

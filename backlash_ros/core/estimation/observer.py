@@ -145,10 +145,9 @@ class Following:
             self.before = self.before.with_model(model)
         if self.observer is not None:
             self.observer = Observer(model, self.observer.noise_std, gains, self.observer)
-            y = np.array(self._y)
+            u, y = np.array(self._u), np.array(self._y)
             if np.isfinite(y).sum() > model.order:
-                x = state_after(model.transfer_function, np.array(self._u), y)
-                self.observer.place(x, True)
+                self.observer.place(state_after(model.transfer_function, u, y), True)
 
     def step(self, y: float | None, interval: Interval, estimate: Estimate) -> None:
         """Process y(k), None if it was lost, and v of the interval before it."""

@@ -91,8 +91,7 @@ class PlantFamily:
         a = multiplied(stable, self._rest, integrator or [1.0])
         while not self.count and not b[-1]:  # trim, unless the length must be the same at all xi
             b.pop()
-        length = max(len(a), len(b))
-        return b + [0j] * (length - len(b)), a + [0j] * (length - len(a))
+        return b + [0j] * (len(a) - len(b)), a + [0j] * (len(b) - len(a))
 
     def model_at(self, xi: list[float]) -> TransferFunction:
         b, a = (np.trim_zeros(np.array(x), 'b') for x in ([0.0, *self.at(xi)[0]], self.at(xi)[1]))
@@ -113,5 +112,7 @@ def _stable(pairs: int, *logs: complex) -> tuple[complex, ...]:
     values, a = list(map(exp, logs)), [1.0 + 0j]
     for omega, damping in zip(values[:2 * pairs:2], values[1:2 * pairs:2], strict=True):
         r, square = exp(-omega * damping), omega * omega * (1.0 - damping * damping)
-        a = multiplied(a, [1.0, -2.0 * r * cos(sqrt(square)), r * r])
+        far = square.real < -1e5  # real poles so far apart that one is 0; the cosine may overflow
+        both = exp(sqrt(-square) - omega * damping) if far else 2.0 * r * cos(sqrt(square))
+        a = multiplied(a, [1.0, -both, r * r])
     return tuple(multiplied(a, *([1.0, -exp(-rate)] for rate in values[2 * pairs:])))

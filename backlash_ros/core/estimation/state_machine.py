@@ -47,14 +47,14 @@ def learn(setup: Setup, record: Window, before: Belief) -> Belief:
             before = before._replace(kept=kept._replace(swapped=swapped))
         after = look[before.state](setup, record, before)
         return after._replace(holds=_holds(setup, record, after))
-    except np.linalg.LinAlgError:
+    except (np.linalg.LinAlgError, ArithmeticError):
         first = max(record.end - settings.FIRST_FIT, record.first)
         return _begun_anew(before, first, record.end, record.end + FEWEST)
 
 
 def _holds(setup: Setup, record: Window, after: Belief) -> bool:
-    """Whether what was known before the run leaves next to nothing of what contradicts the fit."""
-    fit, known = after.fit or after.found, after.inherited
+    """Whether what is published leaves next to nothing of what contradicts the fit."""
+    fit, known = after.fit or after.found, after.published
     if after.reason is not Status.INCONSISTENT or after.coasts or not known:
         return False
     if not fit:

@@ -91,7 +91,8 @@ class ControlLoop:
     def counted(self) -> dict[str, int]:
         names = (*(each.name for each in fields(Counts)), 'wraps')
         return {name: getattr(self.statistics, name) for name in names} | {
-            'dead_workers': self.executor.restarts}
+            'dead_workers': self.executor.restarts,
+            'failed_fits': self.core.estimator.report.failed_fits}
 
     @property
     def estimate(self) -> Estimate:

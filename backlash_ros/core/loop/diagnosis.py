@@ -148,10 +148,11 @@ class Learning(NamedTuple):
 class LoopFigures(Counts):
     """Figures of the loop for the diagnosis; all counts are those of the last few seconds.
 
-    wraps: times that y jumped by 2 pi. dead_workers: processes for fits that died. silent_s:
-    timeout that has passed without y, 0 if it has not; reference_silent_s: the same for y_m, inf
-    before the first one. still: newest values of y in a row that are equal within its noise.
-    v_swing: highest minus lowest v meanwhile; gap: nan until it is learned [unit of v].
+    wraps: times that y jumped by 2 pi. dead_workers: processes for fits that died. failed_fits:
+    fits without a result, also as their process died. silent_s: timeout that has passed without y,
+    0 if it has not; reference_silent_s: the same for y_m, inf before the first one. still: newest
+    values of y in a row that are equal within its noise. v_swing: highest minus lowest v meanwhile;
+    gap: nan until it is learned [unit of v].
     """
 
     timing: Timing
@@ -159,6 +160,7 @@ class LoopFigures(Counts):
     learning: Learning
     wraps: int = 0
     dead_workers: int = 0
+    failed_fits: int = 0
     standing_down: bool = False
     silent_s: float = 0.0
     on_timeout: str = 'hold'
@@ -322,6 +324,8 @@ def causes_of(f: LoopFigures) -> tuple[Row, ...]:
         ('worker', warn, f.dead_workers > 0, 'the process that makes the fits died '
          + (f'{f.dead_workers} times ' if f.dead_workers > 1 else '')
          + 'lately; v is not affected: check the memory'),
+        ('fits', warn, f.failed_fits > f.dead_workers, 'the newest fits failed, so the estimates '
+         'may be old; v is not affected: report it, with a bag'),
         ('behind', warn, overdue_s > BEHIND_S, f'the fits are {overdue_s:.0f} s behind; v is not '
          'affected: leave more of the machine to their process'),
     )
@@ -349,7 +353,7 @@ def state_beside(causes: set[str], f: LoopFigures) -> Finding:
         ('adaptation off', ok, not adapting and status != Status.INCONSISTENT,
          'estimates held by ~/freeze_adaptation; outputs are still answered'),
         ('known', ok, law.unconfirmed and status == Status.ACQUIRING,
-         'earlier estimates hold, not confirmed so far: move v at several speeds'),
+         'earlier estimates hold, not confirmed by newer samples: move v at several speeds'),
         ('bound', warn, law.forbidden is not None and status == Status.ACQUIRING,
          f'{name} is {value:.4g}, beyond estimator.bounds.{name} [{low:g}, {high:g}]: widen it'
          + (', or correct the zero of y' if name != 'm' else '')),

@@ -223,6 +223,11 @@ def test_one_of_two_explanations_is_not_said_to_track(seed: int) -> None:
     assert Sequence(seed).run()['wrong'] == []
 
 
+@pytest.mark.filterwarnings('ignore')
+def test_samples_that_nothing_explains_make_no_fit_fail() -> None:
+    assert Sequence(3444).run()['failed'] == []  # a flipped sensor: all fits diverge
+
+
 PERIOD_NS = 10_000_000
 MOVE = 0.5  # at most, from sample to sample
 

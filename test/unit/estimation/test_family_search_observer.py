@@ -47,6 +47,16 @@ def test_slopes_are_those_of_the_coefficients(plant: tuple[list[float], list[flo
             np.testing.assert_allclose(slope[:len(found)], found, atol=1e-8)
 
 
+@pytest.mark.parametrize('far', [-1e3, 1e3])
+def test_coefficients_are_finite_however_far_a_fit_strays(far: float) -> None:
+    family = PlantFamily(TransferFunction([0.5, 0.3], [1.0, -0.49, 0.016]), 0.2)
+    xi = np.full(family.count, far).tolist()
+    b, a = family.at(xi)
+    assert sum(b) / sum(a) == pytest.approx(0.8 / 0.526)
+    assert np.abs(np.roots(a)).max() <= 1.0
+    assert all(np.isfinite(slopes).all() for slopes in family.slopes(xi))
+
+
 @pytest.mark.parametrize('omega_t', [0.13, 1.0, 2.5])
 @pytest.mark.parametrize(
     ('lag', 'most'), [(0.0, 1e-6), (0.3, 1e-6), (1.0, 1e-6), (2.6, 1e-6), (0.96, 1e-2)])

@@ -115,6 +115,7 @@ CASES: list[tuple[dict[str, Any], Level, str]] = [
      'v is limited in 66.7 % of the samples: widen control.min'),
     ({'unreported': 60}, Level.WARN, '10 % of the samples came without applied_control'),
     ({'dead_workers': 1}, Level.WARN, 'the process that makes the fits died lately'),
+    ({'failed_fits': 2}, Level.WARN, 'the newest fits failed, so the estimates may be old'),
     ({'law': LawReport(overdue=2500)}, Level.WARN, 'the fits are 12 s behind; v is not affected'),
     ({'dead_workers': 3}, Level.WARN, 'the process that makes the fits died 3 times lately'),
 ]
