@@ -37,7 +37,7 @@ class LawReport:
     noise_ratio: float = nan  # learned over configured std of the noise on y
     unexplained: float = nan  # unexplained motion of u over m times the gap
     coasts: bool = False  # whether the load coasts in the gap, which spoils estimates
-    unconfirmed: bool = False  # whether samples have yet to confirm an earlier estimate
+    unconfirmed: bool = False  # whether newer samples do not confirm the estimate that holds
     wrong_sign: bool = False  # whether y moves against v, so that there is no estimate
     reversals: float = nan  # of the load, by a fit that does not yet count as known
     forbidden: OutOfBounds | None = None  # bound that keeps a good estimate from being published

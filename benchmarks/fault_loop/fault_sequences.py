@@ -131,11 +131,6 @@ class Sequence:
         self.driver.offset_ns += int(self.rng.choice([-1, 1])) * int(10 ** self.rng.uniform(6, 10))
         self._freeze()
 
-    def _note_failed_fits(self) -> None:
-        failed = self.controller.loop.core.estimator.report.failed_fits
-        if failed:
-            self.found['failed'].append(f'sample {self.driver.tick}: {failed} fits')
-
     def _restart_controller(self, tick: int) -> None:
         self._note_failed_fits()
         rng, controller = self.rng, self.controller
@@ -295,6 +290,11 @@ class Sequence:
             f'c_r {e.c_r:.5g} ({c_r:.5g}) ± {e.std_c_r:.2g}, '
             f'c_l {e.c_l:.5g} ({c_l:.5g}) ± {e.std_c_l:.2g}; after: {self._lately}'
         )
+
+    def _note_failed_fits(self) -> None:
+        failed = self.controller.loop.core.estimator.report.failed_fits
+        if failed:
+            self.found['failed'].append(f'sample {self.driver.tick}: {failed} fits')
 
     def _freeze(self) -> None:
         """Hold y_m until the loop goes on: then v has no reason to move."""
