@@ -6,7 +6,7 @@ moves from point to point with rests, while the true plant differs from the nomi
 All cases, one seed each:     python benchmarks/ordinary_motions.py
 Some of them, three seeds:    ... --cases 'sine|moves' exact --seeds 3 --by motion
 Drawn from all that is usual: ... --random 40 --first-seed 7 --samples 20000
-The table of the document:    ... --by motion --write
+The table of the document:    ... --by motion --seeds 3 --write
 """
 
 import os

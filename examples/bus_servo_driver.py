@@ -132,7 +132,7 @@ def main() -> None:
     parser.add_argument('--joints', required=True, nargs='+', metavar='NAME=ID')
     parser.add_argument('--baud', type=int, default=1_000_000, help='of the servos')
     parser.add_argument('--rate', type=float, default=100.0, help='cycles per second')
-    parser.add_argument('--speed', type=float, default=3.0, help='largest one of a joint [rad/s]')
+    parser.add_argument('--speed', type=float, default=4.0, help='largest one of a joint [rad/s]')
     parser.add_argument('--patience', type=float, default=4.0, help='with a silent servo [ms]')
     options = parser.parse_args()
     joints = {}

@@ -128,7 +128,7 @@ def _on_cluster(jobs: Sequence[Job], address: str) -> Iterator[Outcome]:
         from distributed import Client, KilledWorker, TimeoutError
     except ImportError:
         raise cli.InputError(
-            "--cluster needs Dask, which is not installed: pip install 'backlash_ros[cluster]'"
+            "--cluster needs Dask, which is not installed: pip install distributed"
         ) from None
     logging.getLogger('distributed').setLevel(logging.CRITICAL)
     try:

@@ -27,8 +27,8 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('--seeds', type=int, metavar='N', help='run N seeds, from --seed on, in '
                         'parallel and print their statistics')
     parser.add_argument('--cluster', metavar='ADDRESS', help='let the workers of this Dask '
-                        'scheduler (tcp://HOST:PORT) do the runs of --seeds and --sweep; needs pip '
-                        "install 'backlash_ros[cluster]'")
+                        'scheduler (tcp://HOST:PORT) do the runs of --seeds and --sweep; needs '
+                        '`pip install distributed`')
     return parser
 
 

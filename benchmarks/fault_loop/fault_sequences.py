@@ -33,7 +33,7 @@ KINDS = {  # of what may be found
     'outside': 'a command outside the limits that held at that moment',
     'too_fast': 'a move beyond `control.rate_max`',
     'jumps': 'a jump at the first command after an interruption',
-    'unbounded': 'u_d further from what y_m asks for than tracking.md says',
+    'unbounded': 'u_d more than twice as far from what y_m asks for as tracking.md says',
     'broken': 'an exception',
     'failed': 'a fit without a result',
     'wrong': '*tracking* with an estimate off by more than five published deviations',

@@ -54,7 +54,7 @@ HEAD = """# Parameters
 
 Made from [table.py](../../backlash_ros/core/parameters/table.py) by `make docs`; do not edit.
 The nodes, `bringup` and `simulate` all read one YAML file:
-[paper_example.yaml](../../config/paper_example.yaml) shows every group.
+[paper_example.yaml](../../config/paper_example.yaml) shows those that are used most.
 `y`, `y_m`, `u` and `v` stand for the units of those signals. Parameters marked *live* may change in
 a running node; all others of `controller`, but for those marked *fixed*, while it is unconfigured.
 
