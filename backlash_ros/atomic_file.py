@@ -14,8 +14,10 @@ def write_atomically(path: Path, content: str | bytes) -> None:
             # Otherwise a power cut may leave an empty file under the new name.
             os.fsync(file.fileno())
         os.replace(temporary, path)
-    except BaseException:
+    except BaseException as error:
         temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            error.filename = str(path)  # a full disk names none
         raise
 
 
@@ -24,7 +26,11 @@ def point_link(link: Path, target: str) -> None:
     temporary = _beside(link)
     temporary.unlink(missing_ok=True)
     temporary.symlink_to(target)
-    os.replace(temporary, link)
+    try:
+        os.replace(temporary, link)
+    except OSError:  # a folder stands there
+        temporary.unlink()
+        raise
 
 
 def _beside(path: Path) -> Path:

@@ -52,6 +52,7 @@ class Topic(NamedTuple):
 
 BagMessage = tuple[Topic, int, bytes]  # stamp [ns], content in CDR
 
+
 class Bag:
     """A bag open for writing. A RecordingError closes it; what was flushed before is kept.
 
@@ -66,8 +67,9 @@ class Bag:
         self.survives_a_crash = True
         self._types = get_typestore(Stores.ROS2_JAZZY)
         self._lock = ExitStack()
-        if self.path.exists():
-            raise ParameterError('bag', path, 'exists already', 'name a new folder')
+        with suppress(OSError):  # then it cannot be made, either
+            if self.path.exists():
+                raise ParameterError('bag', path, 'exists already', 'name a new folder')
         self._writer = Writer(self.path, version=9, storage_plugin=StoragePlugin[storage.upper()])
         try:
             with self._closed_on_error():
@@ -187,19 +189,26 @@ class BagReader:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path, self.files = path, message_files(path)
+        self.path = path
         self.topics: set[Topic] = set()
         self.damage = ''
-        if not self.files:
+        try:
+            self.files = message_files(path)
             rule = 'does not exist' if not path.exists() else \
                 'holds no .mcap and no .db3 file' if path.is_dir() else \
                 'is neither the folder of a bag nor an .mcap or .db3 file'
+        except OSError as error:
+            raise NoBagError(f'{path}: cannot be read: {error.strerror}') from None
+        if not self.files:
             raise NoBagError(f'{path}: {rule}')
 
     def messages(
         self, wanted: Callable[[Topic], bool] = lambda topic: True,
     ) -> Iterator[BagMessage]:
-        """Every intact message of the wanted topics, in the order in which they were written."""
+        """Every intact message of the wanted topics, in the order in which they were written.
+
+        Raises BagError if a file cannot be opened.
+        """
         self.damage = ''
 
         def met(topic: Topic) -> bool:
@@ -208,6 +217,10 @@ class BagReader:
 
         for file in self.files:
             read = _read_mcap if STORAGE_OF_SUFFIX[file.suffix] == 'mcap' else _read_sqlite
+            try:
+                file.open('rb').close()
+            except OSError as error:
+                raise BagError(f'{file}: cannot be read: {error.strerror}') from None
             try:
                 yield from read(file, met)
             # Damaged bytes may make a library raise anything.
@@ -242,9 +255,15 @@ def _read_sqlite(file: Path, wanted: Callable[[Topic], bool]) -> Iterator[BagMes
     with closing(sqlite3.connect(uri, uri=True)) as database:
         # Otherwise SQLite refuses a file that has lost its end.
         database.execute('PRAGMA writable_schema = ON')
-        topics = {number: Topic(*rest) for number, *rest in database.execute(
-            'SELECT topics.id, name, type, encoded_message_definition FROM topics '
-            'LEFT JOIN message_definitions ON type = topic_type ORDER BY topics.id')}
+        # ROS 2 Humble and older write no definitions.
+        defined, = database.execute(
+            "SELECT count(*) FROM sqlite_master WHERE name = 'message_definitions'").fetchone()
+        definition, of_types = (
+            'encoded_message_definition', 'LEFT JOIN message_definitions ON type = topic_type',
+        ) if defined else ("''", '')
+        topics = {number: Topic(name, kind, text or '') for number, name, kind, text in
+                  database.execute(f'SELECT topics.id, name, type, {definition} FROM topics '
+                                   f'{of_types} ORDER BY topics.id')}
         chosen = [number for number, topic in topics.items() if wanted(topic)]
         # By number, not by time: the index of the times may be the part that is damaged.
         for number, stamp_ns, data in database.execute(
@@ -281,7 +300,7 @@ def repair(bag: Path) -> list[str]:
 
     Returns lines that say what was saved, none if the bag is complete; raises BagError.
     """
-    bag = bag.resolve()
+    bag = Path(os.path.realpath(bag))
     if bag.is_file():
         raise NoBagError(f'{bag}: is a file: give the folder of the bag')
     reader = BagReader(bag)
@@ -327,6 +346,11 @@ def _rewrite(reader: BagReader, why: str) -> list[str]:
 
 
 def _announce(writer: Writer, topic: Topic) -> Connection:
+    if not topic.definition:
+        jazzy = get_typestore(Stores.ROS2_JAZZY)
+        if topic.message_type not in jazzy.fielddefs:
+            raise BagError(f'{topic.name}: the definition of {topic.message_type} is missing')
+        return writer.add_connection(topic.name, topic.message_type, typestore=jazzy)
     types = get_typestore(Stores.EMPTY)
     try:
         types.register(get_types_from_msg(topic.definition, topic.message_type))

@@ -58,6 +58,15 @@ def add_motion_options(
                         help='drive: stop when y leaves this range')
 
 
+def check_motion_options(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """End the process if options of a motion do nothing without --drive, or are not in order."""
+    for name in ('amplitude', 'rate', 'output_range'):
+        if getattr(options, name) is not None and not options.drive:
+            parser.error(f'--{name.replace("_", "-")} needs --drive')
+    if options.output_range and not options.output_range[0] < options.output_range[1]:
+        parser.error('--output-range LOW HIGH: {} must be < {}'.format(*options.output_range))
+
+
 def find_config(config: Path | None) -> Path:
     """Path of a configuration file, as given or among the shipped ones; the paper's if None."""
     if config is not None and (config.exists() or config.parent != Path()):

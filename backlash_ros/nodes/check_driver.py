@@ -39,6 +39,7 @@ from backlash_ros.options import (
     FAILED,
     OptionParser,
     add_motion_options,
+    check_motion_options,
     find_config,
 )
 
@@ -116,25 +117,26 @@ class CheckDriverNode(ProcessNode):
                 'publish y without pause; widen --output-range, or drive less: --amplitude, --rate',
             ))
         print(driver_check.table(findings), flush=True)
-        if self.options.save is not None:
-            self._save(self.options.save)
-        return DONE if driver_check.all_fit(findings) else FAILED
+        saved = self.options.save is None or self._save(self.options.save)
+        return DONE if saved and driver_check.all_fit(findings) else FAILED
 
     def say(self, text: str) -> None:
         print(f'{self.get_name()}: {text}', file=sys.stderr)
 
-    def _save(self, path: Path) -> None:
+    def _save(self, path: Path) -> bool:
         period = self.settings.sample_period
         record = driver_check.timing_of(self.heard, period).record
         if record is None:
             self.say(f'nothing to save in {path}: v and y were not both heard')
-            return
+            return False
         rows = np.column_stack([period * np.arange(len(record[0])), *record])
         try:
             np.savetxt(path, rows, '%.12g', ',', header='t,v,y', comments='')
-            print(f'saved {len(rows)} samples of v and y in {path}')
         except OSError as error:
             self.say(f'{path}: cannot be written: {error.strerror}')
+            return False
+        print(f'saved {len(rows)} samples of v and y in {path}')
+        return True
 
 
 class DriveNode(CheckDriverNode):
@@ -189,7 +191,7 @@ class DriveNode(CheckDriverNode):
         if self.rivals:
             self.say(f'{control} is published by {self.rivals}: stop that first, '
                      'or leave --drive out')
-            return BAD_INPUT
+            return FAILED if self.heard.controls else BAD_INPUT
         if not self.options.messages:
             return super().tell()
         if self.ended:
@@ -245,6 +247,8 @@ class DriveNode(CheckDriverNode):
                     else 'another signal came'
                 self.say(f'v is held at {v:.6g}: {why}')
                 break
+        else:
+            self.say(f'v is at rest at {v:.6g}')
         # A busy machine may lose a message, but the driver must get this one before the node ends.
         for _ in range(10):
             self._control.publish(Float64(data=v))
@@ -327,9 +331,7 @@ def parse_options(plain: Sequence[str]) -> argparse.Namespace:
     parser.add_argument('--messages', help=argparse.SUPPRESS)
     add_motion_options(parser, 10.0, 'how long to listen')
     options = parser.parse_args(plain)
-    for name in ('amplitude', 'rate'):
-        if getattr(options, name) is not None and not options.drive:
-            parser.error(f'--{name} needs --drive')
+    check_motion_options(parser, options)
     return options
 
 

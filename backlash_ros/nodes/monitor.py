@@ -53,15 +53,11 @@ class MonitorNode(ViewerNode):
         if isinstance(sys.stdout, TextIOWrapper):
             sys.stdout.reconfigure(errors='replace')  # for terminals without ±
         console = Console()
-        try:
-            if console.is_terminal and not console.is_dumb_terminal:
-                self._show(executor, console)
-            else:
-                self.every(1.0, self._print_lines)
-                super().work(executor)
-        except BrokenPipeError:
-            # Otherwise Python reports it again when it flushes at exit.
-            sys.stdout = open('/dev/null', 'w')  # noqa: SIM115
+        if console.is_terminal and not console.is_dumb_terminal:
+            self._show(executor, console)
+        else:
+            self.every(1.0, self._print_lines)
+            super().work(executor)
 
     def _print_lines(self) -> None:
         self.take_messages()

@@ -204,7 +204,8 @@ def main(args: list[str] | None = None) -> int:
             print(f'{RECORDER}: --repair needs the folder of a bag, and nothing else',
                   file=sys.stderr)
             return BAD_INPUT
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.default_int_handler)
         return repair_command(Path(arguments[1]))
     if {'-h', '--help'} & set(arguments):
         print(f'{RECORDER} --repair BAG: make a bag readable that was never closed or is damaged')

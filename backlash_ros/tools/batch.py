@@ -48,7 +48,7 @@ def combinations(texts: Sequence[str]) -> list[dict[str, Value]]:
             raise cli.InputError(f'--sweep names {name} twice')
         try:
             values = yaml.safe_load(f'[{listed}]')
-        except yaml.YAMLError:
+        except (yaml.YAMLError, ValueError):
             values = []
         if not values:
             raise cli.InputError(f'--sweep {text!r} must be KEY=v1,v2,... in YAML')
@@ -128,7 +128,7 @@ def _on_cluster(jobs: Sequence[Job], address: str) -> Iterator[Outcome]:
         from distributed import Client, KilledWorker, TimeoutError
     except ImportError:
         raise cli.InputError(
-            "--cluster needs Dask, which is not installed: pip install distributed"
+            '--cluster needs Dask, which is not installed: pip install distributed'
         ) from None
     logging.getLogger('distributed').setLevel(logging.CRITICAL)
     try:

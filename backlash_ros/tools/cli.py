@@ -6,6 +6,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
+from io import TextIOWrapper
 from math import inf
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -91,6 +92,8 @@ def run_tool(
 
     Call it from the main thread: SIGTERM stops the tool as Ctrl-C does.
     """
+    if isinstance(sys.stdout, TextIOWrapper):
+        sys.stdout.reconfigure(errors='replace')  # for terminals without ±
     handler = signal.signal(signal.SIGTERM, signal.default_int_handler)
     # The interpreter takes a while to end: another Ctrl-C then would change the exit code.
     atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)

@@ -20,7 +20,7 @@ from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.options import OptionParser
 from backlash_ros.tools import cli
 from backlash_ros.tools.config import read_configuration
-from backlash_ros.tools.runs.files import result_directory
+from backlash_ros.tools.runs.files import result_directory, results_folder
 from backlash_ros.tools.runs.read_run import run_loop
 from backlash_ros.topics import BACKLASH
 
@@ -113,8 +113,7 @@ def _compare(args: Sequence[str] | None) -> None:
     configuration = read_configuration(options.config, options.settings, options.seed)
     scenario = configuration.parameters(options.axis)
     samples = cli.number_of_samples(scenario, options.duration)
-    if options.out is not None:
-        result_directory(options.out)  # fails before long runs, not after them
+    results_folder(options.out)
     results = compare(scenario, samples)
     # Imported here, as drawing libraries take a second to load.
     from backlash_ros.tools.figures import draw_error_curves, png

@@ -126,7 +126,7 @@ def parse_setting(text: str) -> tuple[str, str, Value]:
     check_names([name])
     try:
         value = given if isinstance(BY_NAME[name].default, str) else yaml.safe_load(given)
-    except yaml.YAMLError:
+    except (yaml.YAMLError, ValueError):  # the latter for a date that does not exist
         raise ParameterError(name, given, 'is not a value in YAML') from None
     return axis, name, check_value(BY_NAME[name], value)
 
@@ -154,7 +154,7 @@ def _read_sections(path: Path) -> dict[str, dict[str, object]]:
     """Values by section, whose name begins with /, and by flat name."""
     try:
         document = yaml.load(path.read_text(encoding='utf-8'), Loader=_StrictLoader)
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+    except (OSError, ValueError, yaml.YAMLError) as error:
         reason = error.strerror if isinstance(error, OSError) else ' '.join(str(error).split())
         raise InputError(f'{path}: cannot be read: {reason}') from None
     sections = {}

@@ -1,6 +1,7 @@
 """`report`: write report.html, figures and summary.json from a bag or saved results."""
 
 import argparse
+import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
@@ -148,8 +149,9 @@ def make_parser() -> argparse.ArgumentParser:
 
 def _report(args: Sequence[str] | None) -> None:
     options = make_parser().parse_args(args)
-    run = read_run_or_log(options.path.resolve(), options.config, cli.span_of(options),
-                          options.axis, options.columns)
+    path = Path(os.path.realpath(options.path))
+    run = read_run_or_log(
+        path, options.config, cli.span_of(options), options.axis, options.columns)
     out = files.result_directory(options.out)
     write_report(run, out)
     print(out / REPORT_PAGE)

@@ -14,7 +14,13 @@ from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.options import OptionParser
 from backlash_ros.tools import batch, cli
 from backlash_ros.tools.config import read_configuration, write_config
-from backlash_ros.tools.runs.files import CONFIG_FILE, Run, result_directory, write_table
+from backlash_ros.tools.runs.files import (
+    CONFIG_FILE,
+    Run,
+    result_directory,
+    results_folder,
+    write_table,
+)
 from backlash_ros.tools.runs.read_run import run_loop
 from backlash_ros.tools.runs.summary import estimate_table
 from backlash_ros.topics import BACKLASH
@@ -48,8 +54,7 @@ def _once(parameters: Parameters, options: argparse.Namespace) -> None:
     samples = cli.number_of_samples(parameters, options.duration)
     loop = build_closed_loop(parameters)
     cli.print_warnings('simulate', parameters)
-    if options.out is not None:
-        result_directory(options.out)  # fails before a long run, not after it
+    results_folder(options.out)
     run = run_loop(loop, samples)
     directory = result_directory(options.out)
     print(estimate_table(write_report(Run(run, parameters), directory)))
@@ -69,8 +74,7 @@ def _many(parameters: Parameters, options: argparse.Namespace) -> None:
         raise cli.InputError('--seeds and --sweep seed=... exclude each other')
     seeds = range(parameters.seed, parameters.seed + (options.seeds or 1))
     jobs = batch.make_jobs(parameters, changes, seeds, options.duration)
-    if options.out is not None:
-        result_directory(options.out)
+    results_folder(options.out)
     outcomes = batch.run_jobs(jobs, cluster=options.cluster, label='simulate')
     directory = result_directory(options.out)
     write_config(parameters, directory / CONFIG_FILE)

@@ -1,5 +1,6 @@
 """The recorder as a process: killed, stopped, out of room; and what can still be had of its bag."""
 
+import os
 import re
 import resource
 import signal
@@ -16,6 +17,7 @@ from places import ROOT
 from ros_processes import NodeProcess, Probe, RosWorld, ros_world, wait_until
 from rosbags.highlevel import AnyReader
 from std_msgs.msg import Float64, Float64MultiArray
+from waiting import DEADLINE_S
 
 from backlash_ros import topics
 from backlash_ros.bags import BagError, BagReader, damage, message_files
@@ -126,6 +128,20 @@ def test_a_bag_is_read_while_it_is_recorded_and_complete_after_a_signal_amid_a_f
     values = [data for topic, _, data in BagReader(bag).messages()
               if topic.name == f'/{topics.REFERENCE}']
     assert len(values) == counts[f'/{topics.REFERENCE}'] > 100
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_repair_which_says_so(tmp_path: Path, number: signal.Signals) -> None:
+    bag = tmp_path / 'bag'
+    bag.mkdir()
+    os.mkfifo(bag / 'bag.mcap')  # reading it takes as long as it is open here
+    command = [sys.executable, '-m', 'backlash_ros.nodes.recorder', '--repair', str(bag)]
+    with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as process, \
+            (bag / 'bag.mcap').open('wb'):
+        process.send_signal(number)
+        said = process.communicate(timeout=DEADLINE_S)[1]
+    assert (process.returncode, said) == (1, f'recorder: interrupted, nothing of {bag} is lost\n')
+    assert list(tmp_path.iterdir()) == [bag]
 
 
 def test_full_disk_stops_the_recording_and_nothing_else(tmp_path: Path) -> None:

@@ -50,6 +50,7 @@ from backlash_ros.nodes.runtime.executor import Polled, PromptExecutor
 from backlash_ros.options import BAD_INPUT, DONE, FAILED, OptionParser
 from backlash_ros.topics import CLOCK, DIAGNOSTICS
 
+LARGEST_DOMAIN = 232  # that UDP ports are left for
 ENABLED = os.environ.get('BACKLASH_ROS_EVENTS') == '1'
 
 
@@ -269,6 +270,9 @@ def run(
             gc.freeze()
             node.work(executor)
             code = DONE
+        except BrokenPipeError:  # nobody reads any more, as in `monitor | head`
+            # Otherwise Python reports it again when it flushes at exit.
+            sys.stdout, code = open(os.devnull, 'w'), DONE  # noqa: SIM115
         finally:
             node.finish()
             code = node.exit_code or code
@@ -313,6 +317,10 @@ def exit_at_the_latest(within_s: float, code: int) -> Iterator[None]:
 
 def _initialise(arguments: list[str]) -> None:
     prefer_loopback(os.environ)
+    domain = os.environ.get('ROS_DOMAIN_ID', '')
+    if domain.isdecimal() and int(domain) > LARGEST_DOMAIN:
+        raise ParameterError('ROS_DOMAIN_ID', domain, f'is more than {LARGEST_DOMAIN}',
+                             'set a smaller one')
     # rcl would add a useless line to the one that says what is wrong.
     set_logger_level('rcl', LoggingSeverity.FATAL)
     try:
@@ -347,8 +355,10 @@ def unreached(file: str, executable: str, full_name: str) -> str:
     """A complaint if sections of a file seem to be meant for a node but do not reach it, or ''."""
     import yaml  # most nodes start without a file
 
-    # ROS 2 itself has refused files that cannot be read.
-    content = yaml.safe_load(Path(file).read_text(encoding='utf-8')) or ()
+    try:
+        content = yaml.safe_load(Path(file).read_text(encoding='utf-8')) or ()
+    except (yaml.YAMLError, ValueError):  # ROS 2 has taken it all the same
+        return ''
     namespace, _, own = full_name.strip('/').rpartition('/')
     meant = [section for section in (str(name).strip('/') for name in content) if
              difflib.get_close_matches(section.rpartition('/')[2], [own, executable], cutoff=0.8)]

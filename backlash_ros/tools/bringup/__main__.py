@@ -62,7 +62,7 @@ def _bringup(arguments: Sequence[str] | None) -> int:
     from backlash_ros.tools.bringup.watch import report, run
     signal.signal(signal.SIGINT, before)
     axes = prepare(options)
-    live_port = options.live_port or (0 if options.live else None)
+    live_port = 0 if options.live and options.live_port is None else options.live_port
     failure = run(axes, options.record, live_port)
     reported = [axis.made > 0 and report(axis, options.record) for axis in axes]
     return DONE if all(reported) and not failure else FAILED

@@ -4,11 +4,19 @@ import argparse
 import sys
 from collections.abc import Mapping, Sequence
 from functools import partial
+from math import inf
 from pathlib import Path
 
 from backlash_ros.core.parameters import Value
-from backlash_ros.options import DONE, FAILED, OptionParser, add_motion_options, positive
-from backlash_ros.tools.cli import add_options, run_tool, span_of
+from backlash_ros.options import (
+    DONE,
+    FAILED,
+    OptionParser,
+    add_motion_options,
+    check_motion_options,
+    positive,
+)
+from backlash_ros.tools.cli import InputError, add_options, run_tool, span_of
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -73,17 +81,27 @@ def _identify(args: Sequence[str] | None) -> int:
         parser.error('give a RECORD, or --drive')
     if ros_arguments and not options.drive:
         parser.error('--ros-args are for --drive')
+    if options.precision and not options.drive:
+        parser.error('--precision needs --drive')
+    if options.drive and (options.columns or options.from_s or options.to_s < inf):
+        parser.error('--columns, --from and --to are for a RECORD')
+    check_motion_options(parser, options)
     span = span_of(options)
     given: Mapping[str, Value] = {}
     # numpy, scipy and matplotlib are loaded only once the options are valid.
     if options.config is not None:
         from backlash_ros.tools.config import read_configuration
         configuration = read_configuration(options.config)
+        if configuration.joints:
+            raise InputError(f'{configuration.path}: is of several joints: give a file with the '
+                             'limits of one alone, and copy into this one what is identified')
         given = configuration.given(options.axis if configuration.axes else '')
     given_period = options.period or given.get('sample_period')
     period = given_period if isinstance(given_period, float) else None
     if options.drive:
         from backlash_ros.tools.identify.drive import drive
+        from backlash_ros.tools.runs.files import results_folder
+        results_folder(options.out)  # fails before the motion, not after it
         if options.axis:
             ros_arguments = [*(ros_arguments or ['--ros-args']), '-r', f'__ns:=/{options.axis}']
         record = drive(options, given, period, ros_arguments)

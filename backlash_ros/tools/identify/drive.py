@@ -63,9 +63,9 @@ def drive(
         if child.returncode == BAD_INPUT:
             raise InputError('the actuator was not moved, see above')
         if stop.count:
-            raise BrokenOffError('interrupted; v was brought to rest')
+            raise BrokenOffError('interrupted')
         if child.returncode or record is None:
-            raise BrokenOffError('there is no record of a motion')
+            raise BrokenOffError('there is no record of a whole motion')
         return record
 
 

@@ -47,8 +47,9 @@ def write_outcome(
     """Write the files, print the outcome; returns whether the backlash is known."""
     out = result_directory(options.out)
     estimates, text = out.resolve() / 'estimates.json', None
+    for earlier in (out / YAML, estimates):  # of another record, if any
+        earlier.unlink(missing_ok=True)
     if found.usable:
-        estimates.unlink(missing_ok=True)  # of an earlier record, if any
         try:
             parameters = identified_parameters(found, given, estimates)
             text = commented_yaml(parameters, found, record.source, options.axis)

@@ -107,5 +107,6 @@ def read_run_or_log(
 
 
 def _is_samples(path: Path) -> bool:
-    with path.open('rb') as file:
+    with suppress(OSError), path.open('rb') as file:
         return file.readline().decode(errors='replace').startswith(','.join(SAMPLE_COLUMNS[:10]))
+    return False

@@ -45,8 +45,11 @@ class Run(NamedTuple):
             print(f'{tool}: {warning}{note}', file=sys.stderr)
 
 
-def result_directory(out: Path | None) -> Path:
-    """Create out, or results/<UTC time>, to which results/latest points; raises InputError."""
+def results_folder(out: Path | None) -> Path:
+    """Create out, or results, and check that it can be written into; raises InputError.
+
+    Called before a long run, so that the run is not lost.
+    """
     results = out or Path('results')
     try:
         results.mkdir(parents=True, exist_ok=True)
@@ -54,6 +57,12 @@ def result_directory(out: Path | None) -> Path:
         raise InputError(f'{results}: cannot be made a folder: {error.strerror}') from None
     if not os.access(results, os.W_OK):
         raise InputError(f'{results}: cannot be written into: choose another --out')
+    return results
+
+
+def result_directory(out: Path | None) -> Path:
+    """Create out, or results/<UTC time>, to which results/latest points; raises InputError."""
+    results = results_folder(out)
     if out is not None:
         return out
     name = datetime.now(timezone.utc).strftime('%Y-%m-%dT%H-%M-%SZ')
@@ -62,7 +71,11 @@ def result_directory(out: Path | None) -> Path:
         with suppress(FileExistsError):
             directory.mkdir()
             break
-    point_link(results / 'latest', directory.name)
+    try:
+        point_link(results / 'latest', directory.name)
+    except OSError as error:
+        print(f'warning: {results / "latest"} does not point to {directory.name}: '
+              f'{error.strerror}', file=sys.stderr)
     return directory
 
 
@@ -120,7 +133,7 @@ def read_samples(path: Path, sample_period: float | None = None) -> RunRecord:
         with path.open(encoding='utf-8') as file:
             names = tuple(file.readline().strip().split(','))
             cells = np.array([[float(cell or 'nan') for cell in row] for row in csv.reader(file)])
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, csv.Error) as error:
         raise InputError(f'{path}: cannot be read: {error}') from None
     # Older files end with column f.
     if names not in (SAMPLE_COLUMNS, SAMPLE_COLUMNS[:10]):
@@ -129,8 +142,9 @@ def read_samples(path: Path, sample_period: float | None = None) -> RunRecord:
         raise InputError(f'{path}: must hold rows of {len(names)} numbers')
     t = cells[:, 0]
     steps = np.diff(t)
-    if falls := np.flatnonzero(~(steps > 0.0)).tolist():
-        raise InputError(f'{path}: line {falls[0] + 3}: t must rise from row to row')
+    if falls := np.flatnonzero(~((steps > 0.0) & np.isfinite(steps))).tolist():
+        raise InputError(f'{path}: line {falls[0] + 3}: t must be finite, and rise '
+                         'from row to row')
     if sample_period is None and not len(steps):
         raise InputError(f'{path}: needs two samples to tell the sample period')
     period = sample_period or float(steps.min())

@@ -94,15 +94,15 @@ def read_topics(
     types, found, damage = get_typestore(Stores.ROS2_JAZZY), dict[str, Messages](), ''
     try:
         reader = BagReader(path)
+        for topic, stamp_ns, raw in reader.messages(wanted):
+            # Damaged bytes may make the library raise anything.
+            try:
+                message = types.deserialize_cdr(raw, topic.message_type)
+                found.setdefault(topic.name, []).append((stamp_ns, message))
+            except Exception:
+                damage = 'is damaged'
     except BagError as error:
         raise InputError(str(error)) from None
-    for topic, stamp_ns, raw in reader.messages(wanted):
-        # Damaged bytes may make the library raise anything.
-        try:
-            message = types.deserialize_cdr(raw, topic.message_type)
-            found.setdefault(topic.name, []).append((stamp_ns, message))
-        except Exception:
-            damage = 'is damaged'
     for messages in found.values():
         messages.sort(key=lambda each: each[0])
     if damage := reader.damage or damage:

@@ -138,7 +138,7 @@ def test_run_that_breaks_off_says_why() -> None:
 
 @pytest.mark.parametrize(('address', 'installed', 'cure'), [
     ('tcp://127.0.0.1:1', True, 'dask scheduler'), ('nonsense://x', True, 'dask scheduler'),
-    ('tcp://x:1', False, "pip install distributed"),
+    ('tcp://x:1', False, 'pip install distributed'),
 ])
 def test_missing_cluster_is_told_in_one_line(address, installed, cure, monkeypatch, capsys):
     if installed:

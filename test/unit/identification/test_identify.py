@@ -88,9 +88,13 @@ def test_the_loop_with_the_file_follows_wherever_0_of_v_is(tmp_path: Path) -> No
 def test_a_record_of_no_use_is_told_and_leaves_no_parameter_file(tmp_path, capsys):
     v = 0.1 * motion(1200)
     source = write_csv(tmp_path / 'a.csv', v, np.random.default_rng(1).standard_normal(1200))
+    (tmp_path / 'out').mkdir()
+    for name in ('identified.yaml', 'estimates.json'):
+        (tmp_path / 'out' / name).write_text('of another record')
     assert main([str(source), *QUICK, '--out', str(tmp_path / 'out')]) == 1
     assert 'not known: y shows nothing of v' in capsys.readouterr().out
     assert not (tmp_path / 'out' / 'identified.yaml').exists()
+    assert not (tmp_path / 'out' / 'estimates.json').exists()
     assert json.loads((tmp_path / 'out' / 'identified.json').read_text())['usable'] is False
 
 
@@ -101,6 +105,9 @@ def test_a_record_of_no_use_is_told_and_leaves_no_parameter_file(tmp_path, capsy
     ['a.csv', '--integrator', 'perhaps'], ['a.csv', '--precision', '200%'],
     ['a.csv', '--columns', 'x=1'], ['a.csv', '--columns', 't=w'], ['a.csv', '--period', '0'],
     ['a.csv', '--config', 'nowhere.yaml'], ['a.csv', '--ros-args', '-r', 'a:=b'],
+    ['a.csv', '--config', 'arm.yaml', '--axis', 'shoulder'], ['a.csv', '--precision', '1%'],
+    ['a.csv', '--amplitude', '1'], ['--drive', '--output-range', '2', '1'],
+    ['--drive', '--from', '1'], ['--drive', '--columns', 't=a'], ['--drive', '--out', 'a.csv'],
 ])
 def test_bad_options_are_told_in_one_line(tmp_path, monkeypatch, capsys, arguments):
     monkeypatch.chdir(tmp_path)

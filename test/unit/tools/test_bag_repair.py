@@ -1,6 +1,7 @@
 """Bags that lost their writer or their end: nothing that was flushed is lost by the repair."""
 
 import shutil
+import sqlite3
 import struct
 import tempfile
 from collections.abc import Callable, Iterator
@@ -167,12 +168,20 @@ def file_gone(bag: Path) -> None:
     message_file(bag).unlink()
 
 
+def file_shut(bag: Path) -> None:
+    file = message_file(bag)
+    file.unlink()
+    file.mkdir()  # root may read any file
+
+
 @pytest.mark.parametrize(('spoil', 'code', 'words'), [
     (shutil.rmtree, 2, 'does not exist'),
     (lambda bag: (shutil.rmtree(bag), bag.touch()), 2, 'is a file: give the folder'),
     (lambda bag: (shutil.rmtree(bag), bag.mkdir()), 2, 'holds no .mcap and no .db3 file'),
     (nothing_flushed, 1, 'holds no message that could be saved'),
     (file_gone, 2, 'holds no .mcap and no .db3 file'),
+    (file_shut, 1, 'cannot be read: Is a directory'),
+    (lambda bag: (shutil.rmtree(bag), bag.symlink_to(bag)), 2, 'does not exist'),
 ])
 def test_what_cannot_be_repaired_is_refused_in_one_line_and_left_as_it_is(
     tmp_path: Path, finished: dict[str, Finished], capsys: pytest.CaptureFixture[str],
@@ -180,7 +189,7 @@ def test_what_cannot_be_repaired_is_refused_in_one_line_and_left_as_it_is(
 ) -> None:
     bag = tmp_path / finished['mcap'].bag.name
     shutil.copytree(finished['mcap'].bag, bag)
-    if spoil is not file_gone:
+    if spoil not in (file_gone, file_shut):
         (bag / 'metadata.yaml').unlink()
     spoil(bag)
     before = contents(tmp_path)
@@ -189,6 +198,21 @@ def test_what_cannot_be_repaired_is_refused_in_one_line_and_left_as_it_is(
     assert said.out == ''
     assert words in said.err
     assert (said.err.count('\n'), contents(tmp_path)) == (1, before)
+
+
+@pytest.mark.parametrize('torn', [False, True])
+def test_sqlite_without_definitions_is_read_and_repaired(tmp_path, finished, torn):
+    bag = tmp_path / finished['sqlite3'].bag.name
+    shutil.copytree(finished['sqlite3'].bag, bag)
+    with sqlite3.connect(message_file(bag)) as database:  # as ROS 2 Humble writes it
+        database.execute('DROP TABLE message_definitions')
+    database.close()
+    assert damage(bag) == ''
+    if torn:
+        (bag / 'metadata.yaml').unlink()
+        assert is_complete_after_repair(bag)
+        assert numbers_in(bag) == list(map(float, range(MESSAGES)))
+    assert sum(topic.name == '/number' for topic, *_ in BagReader(bag).messages()) == MESSAGES
 
 
 def test_second_repair_keeps_both_originals(tmp_path, finished):

@@ -139,6 +139,7 @@ def test_setting_is_read_like_a_line_of_yaml(text: str, expected: tuple[str, obj
     ('axes=[on]', 'quote true, on'), ('axes=[a/b]', 'must be a list of names'),
     ('structure=square', 'must be one of'),
     ('seed=x', 'must be a number'), ('seed=[', 'is not a value in YAML'),
+    ('seed=2024-13-45', 'is not a value in YAML'), ('seed=1e30', 'must be'),
 ])
 def test_bad_setting_is_refused(text: str, message: str) -> None:
     with pytest.raises((InputError, ParameterError), match=message):

@@ -95,7 +95,7 @@ def test_latency_is_given_in_milliseconds_without_the_unknown(run: run_record.Ru
     assert summary['loop_latency_ms'] == pytest.approx({'p50': 2.0, 'p99': 2.98})
 
 
-def test_latest_points_at_the_newest_folder(tmp_path, monkeypatch):
+def test_latest_points_at_the_newest_folder(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     folders = [results.result_directory(None) for _ in range(3)]
     assert len(set(folders)) == 3
@@ -104,6 +104,11 @@ def test_latest_points_at_the_newest_folder(tmp_path, monkeypatch):
     assert latest.resolve() == folders[-1].resolve()
     # Relative, so that the results can be moved.
     assert str(latest.readlink()) == folders[-1].name
+    latest.unlink()
+    latest.mkdir()
+    assert results.result_directory(None).is_dir()
+    assert 'latest does not point to' in capsys.readouterr().err
+    assert not list(latest.parent.glob('.latest*'))
     monkeypatch.setattr(results.os, 'access', lambda *_: False)
     with pytest.raises(InputError, match='choose another --out'):
         results.result_directory(latest)
@@ -125,7 +130,8 @@ def test_file_is_replaced_whole_or_not_at_all(tmp_path: Path) -> None:
     (f'{OLD_HEADER}\n', 'must hold rows of 10 numbers'),
     (f'{OLD_HEADER}\n0,1\n', 'must hold rows of 10 numbers'),
     (f'{OLD_HEADER}\n0,1,1,1,1,x,1,1,1,1\n', "could not convert string to float: 'x'"),
-    (f'{OLD_HEADER}\n' + '0,1,1,1,1,1,1,1,1,1\n' * 2, 'line 3: t must rise'),
+    (f'{OLD_HEADER}\n' + '0,1,1,1,1,1,1,1,1,1\n' * 2, 'line 3: t must be finite, and rise'),
+    (f'{OLD_HEADER}\n0,1,1,1,1,1,1,1,1,1\ninf,1,1,1,1,1,1,1,1,1\n', 'line 3: t must be finite'),
     (f'{OLD_HEADER}\n0,1,1,1,1,1,1,1,1,1\n', 'needs two samples'),
 ])
 def test_mistake_in_samples_names_the_line(tmp_path: Path, text: str, message: str) -> None:
