@@ -46,7 +46,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     '--axis': {'default': '', 'metavar': 'NAME', 'help': 'which one of several axes or joints'},
     '--seed': {'type': int, 'metavar': 'N', 'help': 'seed of the simulated noise'},
     '--duration': {'type': float, 'metavar': 'SECONDS', 'help': 'length of a run (default: the '
-                   'parameter samples, or 10 s)'},
+                   'parameter samples, or about 10 s)'},
     '--from': {'type': float, 'default': 0.0, 'metavar': 'S', 'dest': 'from_s', 'help': 'leave '
                'out what was before this time [s]'},
     '--to': {'type': float, 'default': inf, 'metavar': 'S', 'dest': 'to_s', 'help': 'leave out '
@@ -70,10 +70,10 @@ def span_of(options: argparse.Namespace) -> Span:
 
 
 def number_of_samples(parameters: Parameters, duration: float | None) -> int:
-    """Length of a run: duration [s] if given, else the parameter samples, else 10 s."""
-    if duration is None and parameters.samples > 0:
-        return parameters.samples
-    duration, period = 10.0 if duration is None else duration, parameters.sample_period
+    """Length of a run: duration [s] if given, else the parameter samples, else about 10 s."""
+    period = parameters.sample_period
+    if duration is None:
+        return parameters.samples or max(round(10.0 / period), 100)
     if not 0.0 < duration < inf:
         raise InputError(f'--duration={duration!r} must be finite and > 0')
     samples = round(duration / period)

@@ -77,6 +77,8 @@ class AdaptiveController:
                 f'y={y!r}, y_m={y_m!r}, applied={applied!r} and commands={commands!r} must be '
                 f'finite and no larger than {LARGEST_SIGNAL:g}')
         serial, inverse = self._serial, self.inverse
+        if self.redesign is not None:
+            self.redesign.waited += 1
         if self._newest is not None:
             sent, y_m_before, u_d_before = self._newest
             self.lost_samples += lost
@@ -139,7 +141,8 @@ class AdaptiveController:
     def retune(self, p: Parameters) -> None:
         """Apply new values of the live parameters of law and structure; keep what was learned."""
         self.estimator.retune(p)
-        self.structure.retune(p, self._source)
+        if self.structure.retune(p, self._source) and self.redesign is not None:
+            self.redesign.restart()
 
     def close(self) -> None:
         """Release what the estimator and the redesign hold in the executor."""
@@ -168,15 +171,22 @@ class Redesign:
     adopted: StateModel | None = None  # the learned G in use
     considered: StateModel | None = None  # the newest proposal that a design was begun for
     failed: int = 0  # designs that failed
+    waited: int = 0  # samples since gains first waited to take over, or since a design began
     _gains: object | None = None  # finished gains that wait to take over
-    _waited: int = 0  # samples for which they have waited
+    _outdated: bool = False  # whether the design under way is
+
+    def restart(self) -> None:
+        """Design anew what has not taken over yet."""
+        self.considered, self._gains, self._outdated = None, None, self.channel.busy
 
     def due(
         self, proposal: StateModel | None, structure: ControlStructure, serial: SerialPlant | None,
     ) -> object | None:
         """Return gains for `considered` if they may take over now, else None. proposal: a new G."""
         if proposal is not None and proposal is not self.considered and not self.channel.busy:
-            self.considered, self._gains, self._waited = proposal, None, 0
+            # A newer design does not begin to wait once more.
+            self.waited = 0 if self._gains is None else self.waited
+            self.considered, self._gains = proposal, None
             model = proposal if serial is None else serial.before(proposal)
             job = structure.redesign(model)
             if job is None:
@@ -184,6 +194,8 @@ class Redesign:
             else:
                 self.channel.submit(job)
         found = self.channel.poll()
+        if found is not None and self._outdated:
+            self._outdated, found = False, None
         if isinstance(found, Failure):
             if found.kind == LOST:
                 self.considered = None  # the worker died: try the same proposal again
@@ -191,10 +203,7 @@ class Redesign:
                 self.failed += 1
         elif found is not None:
             self._gains = found
-        if self._gains is None:
-            return None
-        self._waited += 1
-        if not structure.may_change and self._waited <= LONGEST_WAIT:
+        if self._gains is None or (not structure.may_change and self.waited <= LONGEST_WAIT):
             return None
         gains, self._gains = self._gains, None
         return gains

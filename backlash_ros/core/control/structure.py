@@ -66,8 +66,12 @@ class ControlStructure:
     def restart(self) -> None:
         """Continue after an interruption: x_hat begins anew, and y_m may have moved meanwhile."""
 
-    def retune(self, p: Parameters, source: Law) -> None:
-        """Apply new values of live parameters from the next sample on; source: as in `adopt`."""
+    def retune(self, p: Parameters, source: Law) -> bool:
+        """Apply new values of live parameters from the next sample on; source: as in `adopt`.
+
+        Returns whether gains that were designed with the old values are outdated.
+        """
+        return False
 
 
 class Proportional(ControlStructure):
@@ -132,7 +136,8 @@ class Proportional(ControlStructure):
 def _on_the_line(y_m: float, e: Estimate, side: Region) -> float:
     """Return the v that solves (3.2) on the line of this side."""
     c = e.c_r if side is RIGHT else e.c_l
-    return c + (y_m + e.f * c) / (e.m - min(e.f, LARGEST_F_OVER_M * e.m))
+    f = min(e.f, LARGEST_F_OVER_M * e.m)
+    return c + (y_m + f * c) / (e.m - f)
 
 
 class PolePlacement(ControlStructure):

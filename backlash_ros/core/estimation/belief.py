@@ -100,7 +100,8 @@ def shortened(
     v = nan if side == Region.GAP else float(p[-1] - fit.gap if left else p[-1])
     begin = replace(fit, p0=float(p[-1]), x=np.zeros(len(fit.x)), knots=np.zeros(0))
     older = _aged(setup, fit, problem.remembered(fit, cut), cut)
-    for beside in (older._replace(v=v, left=left), None):
+    # Beside an inherited estimate they are not needed, and linearized far from it they mislead.
+    for beside in (*[older._replace(v=v, left=left)] * (belief.inherited is None), None):
         problem = setup.problem(rest, beside)
         shorter = problem.finished(problem.fitted(problem.begun(begin)))
         if shorter.left.rms < 2.0 * fit.left.rms:

@@ -1,9 +1,9 @@
 """The default law: records samples, has them fitted outside the loop, publishes the results.
 
-Moving-horizon estimation of backlash, G, its state and the noise at once (C. V. Rao, J. B.
-Rawlings, D. Q. Mayne, IEEE Trans. Automatic Control 48 (2003) 246-258).
+Moving-horizon estimation (C. V. Rao et al., IEEE Trans. Automatic Control 48 (2003) 246-258).
 """
 
+from contextlib import suppress
 from dataclasses import replace
 from math import hypot, nan
 from typing import NamedTuple
@@ -15,20 +15,21 @@ from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.estimation import settings
 from backlash_ros.core.estimation.belief import Belief, Kept, Known
 from backlash_ros.core.estimation.explanations import Setup
-from backlash_ros.core.estimation.observer import Following, Place, gains_of, state_after
+from backlash_ros.core.estimation.fit import FEW_STEPS
+from backlash_ros.core.estimation.observer import Following, Place
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.state_machine import learn
 from backlash_ros.core.jobs import Executor, Failure
 from backlash_ros.core.law import Interval, Law, LawReport
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.parameters import Bounds, Parameters
-from backlash_ros.core.plant.numerics import Gain
+from backlash_ros.core.plant.numerics import Gain, gains_of, state_after
 from backlash_ros.core.plant.transfer_function import Array, StateModel, TransferFunction
 from backlash_ros.core.window import Recorder, Window
 
 
 class Proposal(NamedTuple):
-    """A learned G, its xi (K,) (empty if G is not to be learned), and gains of its observer."""
+    """A learned G, its xi (K,), and gains of its observer."""
 
     model: StateModel
     xi: Array
@@ -49,7 +50,7 @@ def fitted(
 ) -> Fitted:
     """Update the belief with these samples: the job that is done outside the loop.
 
-    model: G in use, whose state is wanted. proposed: xi of the newest proposal (K,), empty: none.
+    model: G in use, whose state is wanted. proposed: xi of the newest proposal (K,).
     """
     record = samples.swapped(before.kept.swapped)
     belief = learn(setup, record.between(record.end - settings.LONGEST), before)
@@ -57,10 +58,14 @@ def fitted(
     if fit is None or belief.published is None:
         return Fitted(belief)
     part = record.swapped(kept.swapped ^ before.kept.swapped).between(kept.first, belief.end)
-    run = setup.problem(part, kept.older).at(fit)
-    newest = slice(-min(len(part.v), 4 * setup.family.memory, settings.ROWS), None)
-    u, y = run.u[newest], part.y[newest]
-    place = Place(float(run.p[-1]), u, y, model, state_after(model, u, y))
+    problem = setup.problem(part, kept.older)
+    if belief.inherited is not None:  # what was known before tells more of the state and of G, too
+        problem = problem.holding(*belief.published.crossings.tolist())
+        with suppress(np.linalg.LinAlgError):
+            fit = problem.fitted(fit, FEW_STEPS)
+    run, last = problem.at(fit), min(len(part.v), 4 * setup.family.memory, settings.ROWS)
+    u, y = run.u[-last:], part.y[-last:]
+    place = Place(float(run.p[-1]), u, y, model, state_after(model, u, y), fit.crossings)
     if not len(proposed) or not belief.trusted or fit.behind(proposed) <= 1.0:
         return Fitted(belief, place)
     better = StateModel(setup.family.model_at(fit.xi))
@@ -92,8 +97,8 @@ class MovingHorizon(Law):
             std = np.array([initial.std_m, initial.std_c_r, initial.std_c_l])
             known = Known(np.array([initial.m, initial.c_r, initial.c_l]), np.diag(std**2))
             self._belief = Belief(inherited=known, published=known)
-        self._following = Following(model, observer)
-        self._proposed = Proposal(model, np.zeros(0 if initial.learned else family.count))
+        self._following, self._followed = Following(model, observer), self.estimate
+        self._proposed = Proposal(model, np.zeros(family.count))
         self._recording = True  # whether learning was on at the newest sample
         self._lost_in_a_row = self._failed_fits = self._reattributed = 0
         self._skipping_fit = False  # whether to ignore the fit under way
@@ -117,8 +122,7 @@ class MovingHorizon(Law):
 
     @property
     def proposal(self) -> StateModel | None:
-        proposed = self._proposed.model
-        return None if proposed is self._following.model else proposed
+        return None if self.learned_model is self._following.model else self.learned_model
 
     @property
     def learned_model(self) -> StateModel:
@@ -148,8 +152,9 @@ class MovingHorizon(Law):
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
     def adopt(self, model: StateModel) -> None:
-        proposed = self._proposed
-        self._following.change_model(model, proposed.gains if model is proposed.model else ())
+        if model is not self._proposed.model:  # learned by the law before this one
+            self._proposed = self._proposed._replace(model=model, gains=())
+        self._following.change_model(model, self._proposed.gains)
 
     def retune(self, p: Parameters) -> None:
         root, e = p.sample_period**0.5, p.estimator
@@ -160,17 +165,18 @@ class MovingHorizon(Law):
         self._channel.close()
 
     def update(self, y: float | None, interval: Interval) -> None:
+        if self.adapting is not self._recording:
+            self._skipping_fit = self._channel.busy  # it knows of no sample after the change
         if self.adapting and not self._recording:
             # Start a new record: samples before the pause do not join those after it.
             before, end = self._belief, self._record.end
             self._belief = Belief(
                 kept=Kept(first=end), end=end, next_at=end + settings.FIRST_FIT,
                 published=before.published, inherited=before.inherited or before.published)
-            self._skipping_fit = self._channel.busy
         self._recording = self.adapting
         self._lost_in_a_row = self._lost_in_a_row + 1 if y is None else 0
         following, family = self._following, self._setup.family
-        following.step(y, interval, self.estimate)
+        following.step(y, interval, self._followed)
         # While v rests, nothing is recorded once the transients of G have died out. What v does
         # within the gap is recorded: the true gap may be narrower than it seems.
         if self.adapting and (family.integrates or following.since_v_moved <= family.memory):
@@ -191,7 +197,8 @@ class MovingHorizon(Law):
             return  # to begin the next fit as well would take twice as long
         resting = following.observer and following.since_motion > setup.family.memory
         due = self._record.end >= self._belief.next_at and not resting
-        if not self.adapting or not (due or following.surprised):
+        empty = self._record.end <= self._belief.kept.first
+        if not self.adapting or empty or not (due or following.surprised):
             return
         following.beyond += following.surprised  # only once per surprise
         channel.submit(fitted, self._record.since(self._belief.kept.first), setup, self._belief,
@@ -212,14 +219,17 @@ class MovingHorizon(Law):
         news = belief.published is not before.published or belief.coasts is not before.coasts
         if belief.published is not None and news:
             self.estimate = self._estimate_of(belief, belief.published)
+        self._followed = self.estimate
         if place is None or fit is None:
             return
         self._proposed = result.better or self._proposed
         if not belief.trusted and following.observer is not None:
             following.observer.settle(fit.noise)  # no fit gives the state
             return
+        m, c_r, c_l = place.crossings.tolist()
+        self._followed = replace(self.estimate, m=m, c_r=c_r, c_l=c_l)
         newer = self._record.since(belief.end)
-        following.go_on_from(place, np.array([newer.v, newer.y]), self.estimate, fit.noise,
+        following.go_on_from(place, np.array([newer.v, newer.y]), self._followed, fit.noise,
                              belief.trusted)
 
     def _estimate_of(self, belief: Belief, known: Known) -> Estimate:

@@ -7,6 +7,8 @@ that ends at 0. The noise is integrated out in closed form (Normal-Gamma), the s
 the prior of s is log-normal around 1: G is expected to be about as wrong as configured.
 """
 
+from __future__ import annotations
+
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
@@ -19,16 +21,9 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimation import posterior
 from backlash_ros.core.estimation.posterior import Prior, WindowFit
+from backlash_ros.core.plant import numerics
 from backlash_ros.core.plant.backlash import Region, engaged, play, reversals, strokes_of
-from backlash_ros.core.plant.numerics import (
-    lfilter,
-    padded,
-    sensitivities,
-    shifted,
-    state_responses,
-    step_of,
-    triangle,
-)
+from backlash_ros.core.plant.numerics import lfilter, padded, sensitivities, shifted, triangle
 from backlash_ros.core.plant.transfer_function import Array, Family
 
 STEPS, FIRST_STEPS, FEW_STEPS = 16, 6, 3  # limits on the number of Gauss-Newton steps
@@ -66,7 +61,7 @@ class Problem:
         self._leaks = 0 if self.older.rows[:, 3:].any() else family.leaks  # prior not counted yet
         self.known = np.isfinite(y)
         self.y = np.where(self.known, y, 0.0)
-        self.step_of_readings = step_of(y) if step is None else step
+        self.step_of_readings = numerics.step_of(y) if step is None else step
         self._runs: dict[WindowFit, Run] = {}
 
     def at(self, f: WindowFit) -> Run:
@@ -83,6 +78,15 @@ class Problem:
             run = Run(b, a, p, u, y, error, likelihood, weights, number)
             self._runs = dict([*self._runs.items(), (f, run)][-3:])
         return self._runs[f]
+
+    def holding(self, m: float, c_r: float, c_l: float) -> Problem:
+        """The same problem with this backlash, as if known to a millionth."""
+        gap = max(c_r - c_l, 1e-9 * float(np.ptp(self.v)))
+        known = 1e6 / np.array([m, m * gap, gap])
+        rows = np.vstack([self.older.rows, np.eye(3, 3 + self.family.count) * known[:, None]])
+        values = np.append(self.older.values, known * [m, m * c_r, gap])
+        return Problem(self.family, self.v, np.where(self.known, self.y, np.nan), self.nominal,
+                       self.older._replace(rows=rows, values=values), self.step_of_readings)
 
     def residual(self, f: WindowFit) -> Array:
         """Readings minus the simulated output (N,), nan where y was lost."""
@@ -308,7 +312,7 @@ class Problem:
         """This fit with X, and o too if `offset`, from linear least squares; f if y overflows."""
         there = replace(f, x=np.zeros(1), step=0.0)  # far from the intervals
         run, count = self.at(there), len(self.v)
-        columns = [*state_responses(run.a, count)]
+        columns = [*numerics.state_responses(run.a, count)]
         if offset:
             columns.append(lfilter(run.b, [1.0], lfilter([1.0], run.a, np.full(count, -1.0))))
         rows = np.column_stack([*columns, run.error])[self.known]

@@ -23,15 +23,8 @@ from backlash_ros.core.estimation.settings import GATE, OUTLIERS, ROWS
 from backlash_ros.core.law import Interval
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.plant.backlash import clamp, play
-from backlash_ros.core.plant.numerics import Gain, gain_of
-from backlash_ros.core.plant.transfer_function import Array, StateModel, TransferFunction, powers
-
-# Effects of the noise on u that gains are designed for, relative to the noise on y (`gain_of`).
-RATIOS = tuple(10.0**exponent for exponent in range(-4, 5))
-
-
-def gains_of(model: StateModel) -> tuple[Gain, ...]:
-    return tuple(gain_of(model, ratio) for ratio in RATIOS)  # takes too long for the loop
+from backlash_ros.core.plant.numerics import RATIOS, Gain, gain_of, state_after
+from backlash_ros.core.plant.transfer_function import Array, StateModel, TransferFunction
 
 
 class Observer:
@@ -89,25 +82,17 @@ class Observer:
 
 
 class Place(NamedTuple):
-    """Where a fit ends: p, and x of `model` in observer form; u, y of its newest samples (M,)."""
+    """Where a fit ends: p, and x of `model` in observer form; u, y of its newest samples (M,).
+
+    crossings: m, c_r, c_l (3,) of which these are, and with which they go on.
+    """
 
     p: float
     u: Array
     y: Array
     model: TransferFunction
     x: Array
-
-
-def state_after(model: TransferFunction, u: Array, y: Array) -> Array:
-    """State of G (observer form) after u (M,), by least squares from y (M,), nan where lost."""
-    a, b, c = model.state_space()
-    responses = powers(a, b, len(u))
-    # Not by lfilter: the loop runs this too, and importing SciPy would make a command late.
-    forced = np.convolve(responses @ c, u)[:len(u)]
-    columns = powers(a.T, a.T @ c, len(u))  # response to the initial state
-    known = np.isfinite(y)
-    before = np.linalg.lstsq(columns[known], (y - forced)[known], rcond=1e-12)[0]
-    return np.asarray(np.linalg.matrix_power(a, len(u)) @ before + u[::-1] @ responses)
+    crossings: Array
 
 
 class Following:

@@ -58,6 +58,11 @@ class Newest:
     unanswered: int = 0  # outputs that had to wait for a known v
 
 
+def still_band(p: Parameters) -> float:
+    """Motion of y within which it counts as standing still: six standard deviations of noise."""
+    return 6.0 * p.estimator.output_noise_std
+
+
 class ControlLoop:
     """Answers the outputs of one joint with commands, whatever the driver does.
 
@@ -71,8 +76,7 @@ class ControlLoop:
         executor: Executor | None = None,
     ) -> None:
         self.counter, self.heard, self.phase = counter, Newest(), Phase.BEGINS
-        # Within six standard deviations of its noise, y counts as standing still.
-        counts = LoopStatistics(still_band=6.0 * p.estimator.output_noise_std)
+        counts = LoopStatistics(still_band=still_band(p))
         self.commands = CommandHistory(p.sample_period, report_use(p), counts)
         self.executor = executor or Executor()
         self.core = build_controller(p, estimate, self.executor)
@@ -306,6 +310,7 @@ class ControlLoop:
     def take_up(self, p: Parameters) -> None:
         """Apply new values of the live parameters, and keep what was learned."""
         self._p, core = p, self.core
+        self.statistics.still_band = still_band(p)
         core.limits = build_limits(p)
         core.inverse.direction_band = p.inverse.direction_band
         core.inverse.take_up = p.inverse.take_up_rate * p.sample_period

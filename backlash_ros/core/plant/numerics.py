@@ -16,7 +16,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from backlash_ros.core.parameters import ParameterError
-from backlash_ros.core.plant.transfer_function import Array, Family, StateModel, TransferFunction
+from backlash_ros.core.plant.transfer_function import (
+    Array,
+    Family,
+    StateModel,
+    TransferFunction,
+    powers,
+)
 
 
 def lfilter(
@@ -193,6 +199,27 @@ def gain_of(model: StateModel, ratio: float) -> Gain:
     return Gain(
         tuple((model.to_observer @ column).tolist()), sqrt(variance),
         p - np.outer(column, column) * variance, sqrt(float(c @ quiet @ c) + 1.0))
+
+
+# Effects of the noise on u that gains are designed for, relative to the noise on y (`gain_of`).
+RATIOS = tuple(10.0**exponent for exponent in range(-4, 5))
+
+
+def gains_of(model: StateModel) -> tuple[Gain, ...]:
+    """Gains for all RATIOS; takes too long for the loop."""
+    return tuple(gain_of(model, ratio) for ratio in RATIOS)
+
+
+def state_after(model: TransferFunction, u: Array, y: Array) -> Array:
+    """State of G (observer form) after u (M,), by least squares from y (M,), nan where lost."""
+    a, b, c = model.state_space()
+    responses = powers(a, b, len(u))
+    # Not by lfilter: the loop runs this too, and importing SciPy would make a command late.
+    forced = np.convolve(responses @ c, u)[:len(u)]
+    columns = powers(a.T, a.T @ c, len(u))  # response to the initial state
+    known = np.isfinite(y)
+    before = np.linalg.lstsq(columns[known], (y - forced)[known], rcond=1e-12)[0]
+    return np.asarray(np.linalg.matrix_power(a, len(u)) @ before + u[::-1] @ responses)
 
 
 class FourBlocks(NamedTuple):

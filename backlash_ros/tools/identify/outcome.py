@@ -169,6 +169,8 @@ def identified_parameters(
         'control.min': round(float(found.v.min()), digits),
         'control.max': round(float(found.v.max()), digits),
         'control.rate_max': _short(np.abs(np.diff(found.v)).max() / found.sample_period, 4),
+        # A record of several speeds knows G better than a motion that the loop happens to make.
+        'plant.adapt': False,
         **_weights(found, found.details),
         **({'estimator.use_applied_control': 'true'} if actuator else {}),
         **(_reference(found, found.details)

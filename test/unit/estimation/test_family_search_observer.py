@@ -10,13 +10,12 @@ from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR
 from backlash_ros.core.estimation.explanations import Setup, afresh
 from backlash_ros.core.estimation.fit import Problem
 from backlash_ros.core.estimation.late_commands import weighed
-from backlash_ros.core.estimation.observer import RATIOS
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.posterior import WindowFit, independence, likelihood
 from backlash_ros.core.estimation.search import search
 from backlash_ros.core.parameters import Bounds, Parameters
 from backlash_ros.core.plant.backlash import play
-from backlash_ros.core.plant.numerics import gain_of, lfilter
+from backlash_ros.core.plant.numerics import RATIOS, gain_of, lfilter
 from backlash_ros.core.plant.simulated_plant import altered_plant
 from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
 from backlash_ros.core.window import Window

@@ -382,10 +382,10 @@ def shrunk_crossings(estimate: Estimate, deviations: float, known: bool) -> tupl
     Without standard deviations they are 0 until `known`. In a loop around y the smaller gap is the
     safe one: over-compensation starts a limit cycle, under-compensation leaves some backlash.
     """
-    if deviations == 0.0:
-        return estimate.c_r, estimate.c_l
     if isnan(estimate.std_c_r):  # a first guess, or a law that knows no uncertainty
         return (estimate.c_r, estimate.c_l) if known else (0.0, 0.0)
+    if deviations == 0.0:
+        return estimate.c_r, estimate.c_l
     middle = 0.5 * (estimate.c_r + estimate.c_l)
     return (max(estimate.c_r - deviations * estimate.std_c_r, middle),
             min(estimate.c_l + deviations * estimate.std_c_l, middle))

@@ -75,14 +75,16 @@ class Tracking(ControlStructure):
         self.feedback.restart()
         self.hand_over = HandOver(due=self.trajectory.u, widens=True, leading=True)
 
-    def retune(self, p: Parameters, source: Law) -> None:
+    def retune(self, p: Parameters, source: Law) -> bool:
         feedback, tuning = self.feedback, (
             p.tracking, p.inverse.caution, p.estimator.output_noise_std)
-        if tuning != (self._weights, feedback.shrinkage, feedback.y_std):
+        changed = tuning != (self._weights, feedback.shrinkage, feedback.y_std)
+        if changed:
             present = self.trajectory.design
             gains = design(present.model, p.tracking, present.factor)
             self._weights, feedback.shrinkage, feedback.y_std = tuning
             self.adopt(gains, source)
+        return changed
 
     def redesign(self, model: StateModel) -> Callable[[], object | None]:
         return partial(better_design, model, self._weights, self.trajectory.design)
