@@ -147,7 +147,11 @@ def first_guess(p: Parameters) -> Estimate:
 
 def known_before(p: Parameters) -> Estimate:
     """Return the estimate to begin with: that of estimates.file if loaded, else first_guess(p)."""
-    return load_estimate(p) or first_guess(p)
+    guess, loaded, law = first_guess(p), load_estimate(p), p.estimator.law
+    if loaded is None:
+        return guess
+    learns_f = law in ('printed', 'fixed') or (law == 'lms' and p.lms.step_f > 0.0)
+    return loaded if learns_f else replace(loaded, f=guess.f)
 
 
 def takes_model_as_exact(p: Parameters) -> bool:

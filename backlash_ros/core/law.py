@@ -44,7 +44,7 @@ class LawReport:
     waiting: int = 0  # samples that no fit includes yet
     overdue: int = 0  # samples since the fit under way was due
     outliers: int = 0  # readings rejected so far
-    reattributed: int = 0  # intervals so far in which another v acted than commanded
+    reattributed: int = 0  # times so far that another v than commanded was found to have acted
     failed_fits: int = 0  # fits so far without a result
 
 

@@ -171,8 +171,8 @@ def _why_nothing(v: Array, y: Array, options: Options) -> str:
         return (
             f'{int(np.isfinite(y).sum())} samples of y are too few, or lie too unevenly, for an '
             f'order of up to {max(options.orders)}, about '
-            f'{round(needed / (1.0 - search.HELD_OUT))} are needed: record for longer, or '
-            'limit --order')
+            f'{round(needed / (1.0 - search.HELD_OUT))} are needed: record for longer'
+            + ', or limit --order' * (max(options.orders) > search.GENERAL_POLES))
     if np.ptp(v) == 0.0:
         return 'v stood still: move it to and fro, past the gap'
     if np.nanmax(y) == np.nanmin(y):

@@ -69,6 +69,12 @@ class Joint:
     def check_change(self, p: Parameters) -> None:
         """Raise ParameterError for values that cannot be used now."""
         build_controller(p, first_guess(p))
+        if self._node.configured and p.structure == 'pole_placement' \
+                and p.tracking.input_weight != self.p.tracking.input_weight:
+            raise ParameterError(
+                'tracking.input_weight', p.tracking.input_weight,
+                'is not taken up live by pole_placement',
+                'clean the node up, set it, and configure again')
         if self._node.configured and p[NOISE] != self.p[NOISE] \
                 and NOISE not in self.loop.core.estimator.RETUNED:
             raise ParameterError(

@@ -196,6 +196,14 @@ def test_noise_is_not_changed_live_for_a_law_that_would_not_take_it_up() -> None
         assert made.set_parameters(estimator__output_noise_std=2e-3).successful
 
 
+def test_weights_are_not_changed_live_for_a_structure_that_would_not_take_them_up() -> None:
+    with bench(structure='pole_placement') as made:
+        made.run(10)
+        refused = made.set_parameters(tracking__input_weight=0.5)
+        assert 'not taken up live by pole_placement' in refused.reason
+        assert made.set_parameters(inverse__direction_band=0.1).successful
+
+
 def test_all_but_the_interface_may_change_while_unconfigured(tmp_path: Path) -> None:
     file = tmp_path / 'estimates.json'
     with bench(active=False, sample_period=0.5) as made:

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from backlash_ros.core import Estimate, Parameters, Status, build_closed_loop, build_controller
+from backlash_ros.core.assembly import known_before
 from backlash_ros.core.estimate import load_estimate, save_estimate, worth_saving
 from backlash_ros.core.loop.control_loop import ControlLoop, Driver
 from backlash_ros.core.loop.sample_counter import SampleCounter
@@ -105,6 +106,15 @@ def test_a_first_guess_is_not_worth_saving() -> None:
     assert worth_saving(replace(LEARNED, status=Status.INCONSISTENT))
 
 
+@pytest.mark.parametrize(('law', 'step_f', 'f'), [
+    ('moving_horizon', 0.0, 0.1), ('lms', 0.0, 0.1), ('lms', 0.5, 0.2), ('printed', 0.0, 0.2)])
+def test_f_comes_from_the_file_only_for_a_law_that_learns_it(tmp_path, law, step_f, f):
+    p = parameters(tmp_path / 'a.json', **{
+        'estimator.law': law, 'lms.step_f': step_f, 'proportional.f': 0.1})
+    save_estimate(tmp_path / 'a.json', LEARNED, p)
+    assert known_before(p).f == f
+
+
 def test_whoever_builds_a_controller_begins_with_what_was_known(file: Path) -> None:
     p = parameters(file)
     assert build_controller(p).estimator.estimate.c_r == LEARNED.c_r
@@ -116,7 +126,7 @@ def test_whoever_builds_a_controller_begins_with_what_was_known(file: Path) -> N
     loop.reset()
     assert loop.estimate.m == p.estimator.initial.m
     assert summarise(run, p)['began_with'] == {
-        'm': 1.25, 'c_r': 2.5, 'c_l': -3.5, 'f': 0.2, 'from': p.estimates.file}
+        'm': 1.25, 'c_r': 2.5, 'c_l': -3.5, 'f': 0.22, 'from': p.estimates.file}
     plain = Parameters()
     began = summarise(build_closed_loop(plain).run(30), plain)['began_with']
     assert (began['c_r'], began['from']) == (0.5, 'estimator.initial')

@@ -11,7 +11,7 @@ import pytest
 from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core import Parameters, build_closed_loop
 from backlash_ros.core.simulation import run_record
-from backlash_ros.tools.cli import InputError
+from backlash_ros.tools.cli import InputError, number_of_samples
 from backlash_ros.tools.runs import files as results
 from backlash_ros.tools.runs.summary import summarise
 
@@ -93,6 +93,11 @@ def test_latency_is_given_in_milliseconds_without_the_unknown(run: run_record.Ru
     rows[:, run_record.COLUMNS.index('latency_s')] = 0.001, nan, 0.002, 0.003
     summary = summarise(replace(run, rows=rows), None)
     assert summary['loop_latency_ms'] == pytest.approx({'p50': 2.0, 'p99': 2.98})
+
+
+@pytest.mark.parametrize(('period', 'samples'), [(0.01, 1000), (0.009996, 1000), (60.0, 100)])
+def test_without_a_duration_any_sample_period_is_simulated(period: float, samples: int) -> None:
+    assert number_of_samples(Parameters({'sample_period': period}), None) == samples
 
 
 def test_latest_points_at_the_newest_folder(tmp_path, monkeypatch, capsys):
