@@ -1,8 +1,9 @@
 """Gears made of physics: how much of the error that backlash makes is removed, from limits alone.
 
 `python benchmarks/physics.py` identifies each preset of examples/gear_physics.py, closes the loop
-with what was found for five motions, and prints tables; `--write` puts them and a figure into
-docs/physics.md. `--preset robot --motion triangle`: one case.
+with what was found for five motions, then with G alone, so that the gap is learned from nothing,
+and prints tables; `--write` puts them and a figure into docs/physics.md.
+`--preset robot --motion triangle`: one case.
 """
 
 import argparse
@@ -28,11 +29,12 @@ from reporting import (
     write_between,
 )
 
-from backlash_ros.core.estimate import Status
+from backlash_ros.core import Status, build_controller
 
 DOCUMENT = ROOT / 'docs' / 'physics.md'
 REMOVED, OFF = 0.9, 0.1  # bounds: share that is removed, error of the gap under *tracking*
 FROM = ('command', 'motor encoder')  # that v is known from
+GUESS = 1.0 / 3.0  # first guess of the gap over the lost motion where only G is given
 
 
 class Source(NamedTuple):
@@ -57,13 +59,16 @@ class Loop(NamedTuple):
 
 
 class Case(NamedTuple):
-    """One motion of one preset. none: error without compensation. loops: as FROM."""
+    """One motion of one preset. none: error without compensation. loops, alone: as FROM, with all
+    that was identified, and with G alone.
+    """
 
     preset: str
     motion: str
     lost: float
     none: float
     loops: list[Loop]
+    alone: list[Loop]
 
 
 def find(job: tuple[str, bool]) -> Source:
@@ -79,15 +84,22 @@ def judge(job: tuple[str, Source, Source]) -> Case:
     none = nan if parameters is None else gear_runs.uncompensated(
         PRESETS[command.preset], parameters, motion).error
     return Case(command.preset, motion, command.lost, none,
-                [_loop(source, motion, none) for source in sources])
+                [_loop(source, motion, none) for source in sources],
+                [_loop(source, motion, none, GUESS) for source in sources])
 
 
-def _loop(source: Source, motion: str, none: float) -> Loop:
+def _loop(source: Source, motion: str, none: float, guess: float | None = None) -> Loop:
+    """guess: of the gap, over the lost motion; None for what was identified."""
     one = source.identified
     if one.parameters is None:
         return Loop(nan, nan, nan, nan, one.refused)
+    controller = one.controller
+    if guess is not None:
+        c_r = 0.5 * guess * source.lost
+        controller = build_controller(one.parameters.replaced(
+            {'estimator.initial.c_r': c_r, 'estimator.initial.c_l': -c_r}))
     try:
-        run = gear_runs.close_loop(PRESETS[source.preset], one.controller, motion, source.encoder)
+        run = gear_runs.close_loop(PRESETS[source.preset], controller, motion, source.encoder)
     except (ArithmeticError, ValueError) as error:
         return Loop(nan, nan, nan, nan, str(error))
     shares = Counter(run.status[run.first:].tolist())
@@ -128,11 +140,22 @@ def row_of(one: Case) -> list[str]:
     return row
 
 
+ALONE_HEADER = ('preset', 'motion', *(name for v in FROM for name in (
+    f'{v}: removed', 'gap', 'off while tracking', 'states')))
+
+
+def alone_row(one: Case) -> list[str]:
+    row = [one.preset, one.motion]
+    for loop in one.alone:
+        row += [f'{loop.removed:.0%}', f'{loop.gap:.3f}', f'{loop.tracking_off:.1%}', loop.states]
+    return row
+
+
 def wrong(cases: list[Case]) -> list[list[str]]:
     rows = []
     for one in cases:
         for name, loop in zip(FROM, one.loops, strict=True):
-            less = loop.states if loop.error != loop.error else f'removes {loop.removed:.0%}'
+            less = loop.states if loop.error != loop.error else f'removes {loop.removed:.1%}'
             off = f'says tracking with the gap off by {loop.tracking_off:.0%}'
             what = [less] * (not loop.removed >= REMOVED) + [off] * (loop.tracking_off > OFF)
             if what:
@@ -174,16 +197,18 @@ def main() -> None:
     cases = parallel(judge, [(motion, *pair) for pair in pairs for motion in motions], 'loops',
                      options.processes)
     tables = ((FOUND_HEADER, list(map(found_row, sources))), (HEADER, list(map(row_of, cases))),
-              (('run', 'v from', 'what'), wrong(cases)))
+              (('run', 'v from', 'what'), wrong(cases)),
+              (ALONE_HEADER, list(map(alone_row, cases))))
     for table in tables:
         print(format_table(*table))
     if options.write:
         FigureCanvasAgg(figure := draw_hysteresis())
         figure.savefig(ROOT / 'docs' / 'images' / 'physics.png', dpi=80)
-        found, loops, bad = (markdown_table(*table) for table in tables)
+        found, loops, bad, alone = (markdown_table(*table) for table in tables)
         write_between(DOCUMENT, 'physics', '\n\n'.join([
             found, loops, f'Where less than {REMOVED:.0%} is removed, or *tracking* is said with '
             f'the gap off by more than {OFF:.0%}, on {machine()}:', bad]))
+        write_between(DOCUMENT, 'physics, G alone', alone)
 
 
 if __name__ == '__main__':
