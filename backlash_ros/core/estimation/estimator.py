@@ -58,14 +58,16 @@ def fitted(
     if fit is None or belief.published is None:
         return Fitted(belief)
     part = record.swapped(kept.swapped ^ before.kept.swapped).between(kept.first, belief.end)
-    problem = setup.problem(part, kept.older)
-    if belief.inherited is not None:  # what was known before tells more of the state and of G, too
-        problem = problem.holding(*belief.published.crossings.tolist())
-        with suppress(np.linalg.LinAlgError):
-            fit = problem.fitted(fit, FEW_STEPS)
+    problem, crossings = setup.problem(part, kept.older), fit.crossings
+    if belief.inherited is not None:
+        crossings = belief.published.crossings
+        if not fit.systematic:  # it tells more of the state and of G, too; but friction is neither
+            problem = problem.holding(*crossings.tolist())
+            with suppress(np.linalg.LinAlgError):
+                fit = problem.fitted(fit, FEW_STEPS)
     run, last = problem.at(fit), min(len(part.v), 4 * setup.family.memory, settings.ROWS)
     u, y = run.u[-last:], part.y[-last:]
-    place = Place(float(run.p[-1]), u, y, model, state_after(model, u, y), fit.crossings)
+    place = Place(float(run.p[-1]), u, y, model, state_after(model, u, y), crossings)
     if not len(proposed) or not belief.trusted or fit.behind(proposed) <= 1.0:
         return Fitted(belief, place)
     better = StateModel(setup.family.model_at(fit.xi))

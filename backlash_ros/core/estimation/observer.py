@@ -83,9 +83,7 @@ class Observer:
 
 class Place(NamedTuple):
     """Where a fit ends: p, and x of `model` in observer form; u, y of its newest samples (M,).
-
-    crossings: m, c_r, c_l (3,) of which these are, and with which they go on.
-    """
+    crossings: m, c_r, c_l (3,) to go on with."""
 
     p: float
     u: Array
