@@ -286,7 +286,7 @@ class SimulatedPlantParameters:
         0.0, 'simulated fraction of y that never arrives', low=0.0, high=0.99, change='live')
     input_disturbance: float = simulated(0.0, 'simulated constant added to u', 'u', change='live')
     truth: TruePlant
-    seed: int = simulated(1, 'seed of the simulated noise', low=0, high=2**53)
+    seed: int = simulated(1, 'seed of the simulated noise', low=0, high=2**32 - 1)
     samples: int = simulated(0, 'outputs to simulate, 0 for no end', low=0)
 
 
