@@ -117,7 +117,9 @@ the scatter that other seeds would show. Errors are those of c_r or c_l, the wor
 *Beyond five deviations*: share of the *tracking* samples whose error is larger than five published
 deviations; *wrong while tracking*: that, and more than 1 % of the gap. Times are in units of one
 predict + update of a Kalman filter with six states, those over DDS in units of a bare echo node.
-What each row is: [accuracy.py](../../benchmarks/accuracy.py)."""
+What each row is: [accuracy.py](../../benchmarks/accuracy.py).
+The reference is that of the estimator before the present one, whose figures on ordinary motions
+are in [estimation.md](../estimation.md#the-motions-of-most-machines)."""
 
 
 def adopt(rows: dict[str, Row]) -> None:
