@@ -3,6 +3,7 @@
 import argparse
 import os
 import sys
+from io import TextIOWrapper
 from math import inf
 from pathlib import Path
 from typing import NoReturn
@@ -16,6 +17,12 @@ def use_one_thread() -> None:
     # Matrices are tiny: more threads make a fit slower, and take processors from other processes.
     names = 'OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'
     os.environ.update({**dict.fromkeys(names, '1'), **os.environ})
+
+
+def print_any_text() -> None:
+    """Have stdout replace what its encoding lacks, as on terminals without ±."""
+    if isinstance(sys.stdout, TextIOWrapper):
+        sys.stdout.reconfigure(errors='replace')
 
 
 class OptionParser(argparse.ArgumentParser):

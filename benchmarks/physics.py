@@ -93,8 +93,9 @@ def _loop(source: Source, motion: str, none: float, guess: float | None = None) 
     one = source.identified
     if one.parameters is None:
         return Loop(nan, nan, nan, nan, one.refused)
-    controller = one.controller
-    if guess is not None:
+    if guess is None:
+        controller = one.controller
+    else:
         c_r = 0.5 * guess * source.lost
         controller = build_controller(one.parameters.replaced(
             {'estimator.initial.c_r': c_r, 'estimator.initial.c_l': -c_r}))

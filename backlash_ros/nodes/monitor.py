@@ -13,7 +13,6 @@ import time
 import tty
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from io import TextIOWrapper
 from math import isfinite
 from typing import Any
 
@@ -29,6 +28,7 @@ from std_srvs.srv import SetBool, Trigger
 from backlash_ros.nodes.followed import ControllerState, ViewerNode, viewer_options
 from backlash_ros.nodes.runtime.executor import PromptExecutor
 from backlash_ros.nodes.runtime.process import run, split_arguments
+from backlash_ros.options import print_any_text
 from backlash_ros.topics import BACKLASH
 
 SCREEN_PERIOD_S, NOTICE_S = 0.2, 3.0
@@ -50,8 +50,7 @@ class MonitorNode(ViewerNode):
         self._client_of: dict[str, Client] = {}
 
     def work(self, executor: PromptExecutor) -> None:
-        if isinstance(sys.stdout, TextIOWrapper):
-            sys.stdout.reconfigure(errors='replace')  # for terminals without ±
+        print_any_text()
         console = Console()
         if console.is_terminal and not console.is_dumb_terminal:
             self._show(executor, console)

@@ -6,13 +6,12 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
-from io import TextIOWrapper
 from math import inf
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from backlash_ros.core.parameters import ParameterError, Parameters
-from backlash_ros.options import BAD_INPUT, DONE, FAILED
+from backlash_ros.options import BAD_INPUT, DONE, FAILED, print_any_text
 from backlash_ros.tools.records.columns import parse_columns
 
 NOTHING = '–'  # stands in tables for a missing number
@@ -92,8 +91,7 @@ def run_tool(
 
     Call it from the main thread: SIGTERM stops the tool as Ctrl-C does.
     """
-    if isinstance(sys.stdout, TextIOWrapper):
-        sys.stdout.reconfigure(errors='replace')  # for terminals without ±
+    print_any_text()
     handler = signal.signal(signal.SIGTERM, signal.default_int_handler)
     # The interpreter takes a while to end: another Ctrl-C then would change the exit code.
     atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)

@@ -5,7 +5,7 @@ u_d = y_m + f v (3.2), and the four blocks of Tao and Kokotović; the third one 
 
 from collections.abc import Callable
 from math import hypot, inf
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -42,6 +42,7 @@ class ControlStructure:
     The defaults are those of a structure whose gains do not depend on G.
     """
 
+    NOT_RETUNED: ClassVar[tuple[str, ...]] = ()  # live parameters that `retune` does not take up
     delay: int = 0  # samples by which y is meant to follow y_m
 
     @property
@@ -145,6 +146,8 @@ class PolePlacement(ControlStructure):
 
     delay: samples by which B/A_m delays a slow reference, rounded.
     """
+
+    NOT_RETUNED = ('tracking.input_weight',)
 
     def __init__(self, blocks: FourBlocks) -> None:
         self._blocks = blocks

@@ -61,7 +61,7 @@ def fitted(
     problem, crossings = setup.problem(part, kept.older), fit.crossings
     if belief.inherited is not None:
         crossings = belief.published.crossings
-        if not fit.systematic:  # it tells more of the state and of G, too; but friction is neither
+        if not fit.systematic:  # holding it improves x and xi, unless they absorb friction
             problem = problem.holding(*crossings.tolist())
             with suppress(np.linalg.LinAlgError):
                 fit = problem.fitted(fit, FEW_STEPS)

@@ -69,18 +69,18 @@ class Joint:
     def check_change(self, p: Parameters) -> None:
         """Raise ParameterError for values that cannot be used now."""
         build_controller(p, first_guess(p))
-        if self._node.configured and p.structure == 'pole_placement' \
-                and p.tracking.input_weight != self.p.tracking.input_weight:
-            raise ParameterError(
-                'tracking.input_weight', p.tracking.input_weight,
-                'is not taken up live by pole_placement',
-                'clean the node up, set it, and configure again')
-        if self._node.configured and p[NOISE] != self.p[NOISE] \
-                and NOISE not in self.loop.core.estimator.RETUNED:
-            raise ParameterError(
-                NOISE, p[NOISE], f'is not taken up live by {p.estimator.law}',
-                'clean the node up, set it, and configure again',
-            )
+        if not self._node.configured:
+            return
+        core = self.loop.core
+        fixed = dict.fromkeys(core.structure.NOT_RETUNED, p.structure)
+        if NOISE not in core.estimator.RETUNED:
+            fixed[NOISE] = p.estimator.law
+        for name, by in fixed.items():
+            if p[name] != self.p[name]:
+                raise ParameterError(
+                    name, p[name], f'is not taken up live by {by}',
+                    'clean the node up, set it, and configure again',
+                )
 
     def follow_model(self) -> None:
         """Publish ~/model if G has changed, or if a second's worth of samples has passed.
