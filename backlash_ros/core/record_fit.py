@@ -10,6 +10,7 @@ from backlash_ros.core.estimation import explanations, settings
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.posterior import WindowFit
 from backlash_ros.core.parameters import Bounds, Parameters
+from backlash_ros.core.plant.numerics import std_of
 from backlash_ros.core.plant.transfer_function import Array, StateModel, TransferFunction
 from backlash_ros.core.records.readings import check_record, outliers
 from backlash_ros.core.simulation.run_record import turns
@@ -110,7 +111,7 @@ def _fitted(setup: explanations.Setup, v: Array, y: Array, bounds: Bounds | None
         fit = explanations.afresh(setup, record, also=fit) or fit
     reversals = turns(np.append(fit.p0, problem.at(fit).p), 5.0 * fit.gap_std)
     wanted = setup.turns_needed
-    values, stds = (fit.crossings * [sign, 1.0, 1.0]).tolist(), fit.crossings_std.tolist()
+    values, stds = (fit.crossings * [sign, 1.0, 1.0]).tolist(), std_of(fit.crossings_cov).tolist()
     doubts = {
         f'v crossed the gap {reversals} times; at least {wanted} are needed to identify both '
         'crossings': reversals < wanted,

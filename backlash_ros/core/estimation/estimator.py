@@ -23,7 +23,7 @@ from backlash_ros.core.jobs import Executor, Failure
 from backlash_ros.core.law import Interval, Law, LawReport
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.parameters import Bounds, Parameters
-from backlash_ros.core.plant.numerics import Gain, gains_of, state_after
+from backlash_ros.core.plant.numerics import Gain, gains_of, response_slopes, state_after, std_of
 from backlash_ros.core.plant.transfer_function import Array, StateModel, TransferFunction
 from backlash_ros.core.window import Recorder, Window
 
@@ -149,7 +149,7 @@ class MovingHorizon(Law):
         fit, family = self._belief.fit, self._setup.family
         if fit is None:
             return np.full(len(z), nan)
-        slopes = family.response_slopes(fit.xi, z)
+        slopes = response_slopes(family, fit.xi, z)
         variance = np.einsum('ij,jk,ik->i', slopes, fit.cov_xi, slopes.conj()).real
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
@@ -236,7 +236,7 @@ class MovingHorizon(Law):
 
     def _estimate_of(self, belief: Belief, known: Known) -> Estimate:
         values, e = self._setup.bounds.project(*known.crossings.tolist()), self.estimate
-        std_m, std_c_r, std_c_l = np.sqrt(np.maximum(np.diag(known.cov), 0.0)).tolist()
+        std_m, std_c_r, std_c_l = std_of(known.cov).tolist()
         fit = belief.fit or belief.found
         if belief.coasts and fit is not None:
             # The gap is doubtful: a structure that shrinks it by its deviations pushes less.

@@ -18,6 +18,7 @@ from backlash_ros.core.estimation.unmodelled import with_walk
 from backlash_ros.core.law import OutOfBounds
 from backlash_ros.core.parameters import Bounds
 from backlash_ros.core.plant.backlash import play
+from backlash_ros.core.plant.numerics import std_of
 from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.window import Window
 
@@ -55,7 +56,7 @@ class Setup:
         """Whether m, c_r, c_l (3,) of this covariance (3, 3) are known well enough."""
         factor = 1.0 / settings.BY_CHANCE if systematic else 1.0  # these do not average out
         m, c_r, c_l = map(float, crossings)
-        std_m, *std = map(float, np.sqrt(np.maximum(np.diag(cov), 0.0)))
+        std_m, *std = std_of(cov).tolist()
         gap, gap_std = c_r - c_l, sqrt(gap_variance(cov))
         gap_known = max(gap_std, *std) < factor * settings.STD_GAP * gap
         chance = settings.BY_CHANCE * gap_std
@@ -78,7 +79,7 @@ class Setup:
         """Those of m, c_r, c_l that lie outside their bounds by more than chance."""
         values = f.crossings
         apart = np.abs(values - self.bounds.project(*values.tolist()))
-        outside = apart > settings.BY_CHANCE * f.crossings_std + 1e-9 * np.abs(values)
+        outside = apart > settings.BY_CHANCE * std_of(f.crossings_cov) + 1e-9 * np.abs(values)
         return [OutOfBounds(name, float(value), getattr(self.bounds, name)) for name, value, out
                 in zip(('m', 'c_r', 'c_l'), values, outside, strict=True) if out]
 

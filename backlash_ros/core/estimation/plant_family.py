@@ -8,15 +8,12 @@ one sample shorter; ln Omega, ln D of each pair of poles, s^2 + 2 D Omega s + Om
 pole left over. Poles at 0, on the negative axis or outside the unit circle are kept.
 """
 
-from cmath import cos, exp, sqrt
 from collections.abc import Sequence
-from functools import lru_cache
 from math import copysign, floor, inf
 
 import numpy as np
-from numpy.typing import NDArray
 
-from backlash_ros.core.plant.numerics import multiplied, padded, sections_of
+from backlash_ros.core.plant.numerics import denominator_of, multiplied, padded, sections_of
 from backlash_ros.core.plant.transfer_function import ON_CIRCLE, Array, TransferFunction, memory_of
 
 # G jumps where i changes: so far below a whole number of samples, which is the most usual lag. This
@@ -43,7 +40,7 @@ class PlantFamily:
         rest = np.concatenate([poles[elsewhere & ~moving], poles[integrators][1:].round()])
         self._rest: list[float] = np.atleast_1d(np.real(np.poly(rest))).tolist()
         self._pairs, self._nominal = sections_of(poles[moving])
-        a = [x.real for x in _stable(self._pairs, *self._nominal)]
+        a = [x.real for x in denominator_of(self._pairs, *self._nominal)]
         self._gain, self._delay = sum(a), len(model.denominator) - len(b)
         # Delay of B and of A at low frequency [samples]. However short, by default a lag of one
         # sample is usual: a driver may apply v, or read y, a sample later than expected.
@@ -82,9 +79,9 @@ class PlantFamily:
         moved = moved or [0.0] * (2 + len(self._nominal))
         integrator = [1.0, -1.0 + (moved.pop(0) if self.leaks else 0.0)] * self.integrates
         lag, width, *logs = moved
-        stable = _stable(self._pairs, *[x + y for x, y in zip(self._nominal, logs, strict=True)])
-        whole = max(floor(lag.real + BEFORE_WHOLE), 1 - self._delay)
-        gain = sum(stable) / self._gain
+        logs = [x + y for x, y in zip(self._nominal, logs, strict=True)]
+        stable = denominator_of(self._pairs, *logs)
+        whole, gain = max(floor(lag.real + BEFORE_WHOLE), 1 - self._delay), sum(stable) / self._gain
         b = [0j] * (self._delay + whole - 1) + [
             gain * (x + (lag - whole) * move + width * wide)
             for x, move, wide in zip(*self._taps, strict=True)]
@@ -97,22 +94,3 @@ class PlantFamily:
         b, a = (np.trim_zeros(np.array(x), 'b') for x in ([0.0, *self.at(xi)[0]], self.at(xi)[1]))
         length = max(len(b), len(a))
         return TransferFunction(padded(b, length).tolist(), padded(a, length).tolist())
-
-    def response_slopes(self, xi: list[float], z: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        """Derivatives of ln G(z; xi) by each xi at the points z (M,), shape (M, K)."""
-        db, da = self.slopes(xi)
-        powers = 1.0 / z[:, None] ** np.arange(db.shape[1])
-        of_b, of_a = (powers[:, :len(x)] @ np.array(x) for x in self.at(xi))
-        return np.asarray(powers @ db.T / of_b[:, None] - powers @ da.T / of_a[:, None])
-
-
-@lru_cache(maxsize=64)  # of the derivatives by xi, only those by poles change them
-def _stable(pairs: int, *logs: complex) -> tuple[complex, ...]:
-    """Denominator of the poles that depend on xi, given logs of their parameters."""
-    values, a = list(map(exp, logs)), [1.0 + 0j]
-    for omega, damping in zip(values[:2 * pairs:2], values[1:2 * pairs:2], strict=True):
-        r, square = exp(-omega * damping), omega * omega * (1.0 - damping * damping)
-        far = square.real < -1e5  # real poles so far apart that one is 0; the cosine may overflow
-        both = exp(sqrt(-square) - omega * damping) if far else 2.0 * r * cos(sqrt(square))
-        a = multiplied(a, [1.0, -both, r * r])
-    return tuple(multiplied(a, *([1.0, -exp(-rate)] for rate in values[2 * pairs:])))

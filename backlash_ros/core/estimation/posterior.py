@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.settings import CHANCE
-from backlash_ros.core.plant.numerics import chi_square, squares_of
+from backlash_ros.core.plant.numerics import chi_square, log_probability, squares_of
 from backlash_ros.core.plant.transfer_function import Array
 
 SCALES = np.asarray(np.geomspace(3e-4, 10.0, 14), np.float64)  # grid of s
@@ -37,25 +37,12 @@ def likelihood(r: Array, noise_std: float, step: float, weights: Array) -> Likel
     if not step:
         density = -0.5 * (r / noise_std) ** 2 - log(sqrt(2.0 * pi) * noise_std)
         return Likelihood(density, r / noise_std**2, np.full(len(r), noise_std**-2))
-    probability, score, curvature = _of_interval(r / noise_std, 0.5 * step / noise_std)
+    probability, score, curvature = log_probability(r / noise_std, 0.5 * step / noise_std)
     # Each gets at least the mean information, or unknowns could stay undetermined; the sum is kept.
     total = weights @ curvature + 1e-9  # positive even if no reading says anything
     information = np.maximum(curvature, total / (weights.sum() + 1e-9))
     information *= total / (weights @ information + 1e-9)
     return Likelihood(probability - log(step), score / noise_std, information / noise_std**2)
-
-
-def _of_interval(r: Array, half: float) -> tuple[Array, Array, Array]:
-    from scipy.special import log_ndtr  # late: 31 MB that only fits need
-
-    upper, lower = r + half, r - half
-    # From the smaller tail: a difference of two numbers near 1 would be lost to rounding.
-    more, less = log_ndtr(half - np.abs(r)), log_ndtr(-half - np.abs(r))
-    probability = more + np.log(-np.expm1(np.minimum(less - more, -1e-300)))
-    at_upper, at_lower = (
-        np.exp(-0.5 * edge**2 - probability) / sqrt(2.0 * pi) for edge in (upper, lower))
-    score = at_lower - at_upper
-    return probability, score, score**2 + upper * at_upper - lower * at_lower
 
 
 def independence(
@@ -174,10 +161,6 @@ class WindowFit:
     def alike(self, other: WindowFit) -> bool:
         """Whether the backlashes of two fits differ by no more than chance."""
         return agree(self.crossings, other.crossings, self.crossings_cov + other.crossings_cov)
-
-    @property
-    def crossings_std(self) -> Array:
-        return np.asarray(np.sqrt(np.maximum(np.diag(self.crossings_cov), 0.0)))
 
     @property
     def gap_std(self) -> float:

@@ -41,9 +41,8 @@ def learn(setup: Setup, record: Window, before: Belief) -> Belief:
     kept, record = before.kept, record.without(before.kept.rejected)
     try:
         if before.fit is not None and record.is_open:  # late commands are no contradiction
-            p, thorough = setup.problem(record, kept.older), record.end >= before.thorough[0]
-            since = record.first if thorough else before.end - setup.family.memory
-            record, swapped = likelier(p, before.fit, record, since, kept.swapped)
+            since = before.end - setup.family.memory if record.end < before.thorough[0] else 0
+            record, swapped = likelier(setup, record, before.fit, kept.swapped, kept.older, since)
             before = before._replace(kept=kept._replace(swapped=swapped))
         after = look[before.state](setup, record, before)
         return after._replace(holds=_holds(setup, record, after))
@@ -122,7 +121,7 @@ def _with_commands(
         return record, found, swapped
     sent = record, found, swapped
     for _ in range(4):
-        record, now = likelier(setup.problem(record), found, record, record.first, swapped)
+        record, now = likelier(setup, record, found, swapped, None)
         if now == swapped:
             break
         swapped, found = now, afresh(setup, record, also=found) or found

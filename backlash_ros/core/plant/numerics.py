@@ -5,6 +5,7 @@ Reference: E. K.-W. Chu et al., Structure-preserving algorithms for periodic dis
 Riccati equations, Int. J. Control 77 (2004) 767-788.
 """
 
+import cmath
 from bisect import bisect_left, insort
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -44,7 +45,7 @@ def lfilter(
     if state is not None:
         before = np.asarray(state, dtype=np.float64)[..., :count]
         y[..., :before.shape[-1]] += before
-    if len(poles) == 1 or not count:
+    if len(poles) == 1 or not y.size:  # of no rows, LAPACK would write beyond them
         return y
     from scipy.linalg import lapack  # where it is needed: 31 MB
 
@@ -82,6 +83,16 @@ def sensitivities(family: Family, xi: list[float], u: Array, y: Array) -> Array:
     return np.asarray(of_b @ shifted(u, taps) - of_a @ shifted(y, taps))
 
 
+def response_slopes(
+    family: Family, xi: list[float], z: NDArray[np.complex128],
+) -> NDArray[np.complex128]:
+    """Derivatives of ln G(z; xi) by each xi at the points z (M,), shape (M, K)."""
+    db, da = family.slopes(xi)
+    powers_of_z = 1.0 / z[:, None] ** np.arange(db.shape[1])
+    of_b, of_a = (powers_of_z[:, :len(x)] @ np.array(x) for x in family.at(xi))
+    return np.asarray(powers_of_z @ db.T / of_b[:, None] - powers_of_z @ da.T / of_a[:, None])
+
+
 def multiplied(*factors: Sequence[complex]) -> list[complex]:
     """Product of polynomials; with so few coefficients faster than np.convolve."""
     result = [1.0 + 0j]
@@ -105,6 +116,18 @@ def sections_of(poles: NDArray[np.complex128]) -> tuple[int, list[float]]:
         omega = np.sqrt(fast * next_to_it)
         pairs.append((omega, (fast + next_to_it) / 2.0 / omega))
     return len(pairs), np.log([*(q for pair in pairs for q in pair), *real]).tolist()
+
+
+@lru_cache(maxsize=64)  # few of many variations of a G change its poles
+def denominator_of(pairs: int, *logs: complex) -> tuple[complex, ...]:
+    """The polynomial (n + 1,) whose roots are the poles with these `sections_of` them."""
+    values, a = list(map(cmath.exp, logs)), [1.0 + 0j]
+    for omega, damping in zip(values[:2 * pairs:2], values[1:2 * pairs:2], strict=True):
+        r, square = cmath.exp(-omega * damping), omega * omega * (1.0 - damping * damping)
+        both = 2.0 * r * cmath.cos(cmath.sqrt(square)) if square.real > -1e5 else \
+            cmath.exp(cmath.sqrt(-square) - omega * damping)  # one pole is 0; cos may overflow
+        a = multiplied(a, [1.0, -both, r * r])
+    return tuple(multiplied(a, *([1.0, -cmath.exp(-rate)] for rate in values[2 * pairs:])))
 
 
 def is_stable(a: list[float]) -> bool:
@@ -364,6 +387,11 @@ def squares_of(apart: Array, cov: Array) -> float:
     return float(apart @ np.linalg.lstsq(cov, apart, rcond=1e-14)[0])
 
 
+def std_of(cov: Array) -> Array:
+    """Standard deviations (n,) of a covariance (n, n), 0 where rounding made it negative."""
+    return np.asarray(np.sqrt(np.maximum(np.diag(cov), 0.0)))
+
+
 def chi_square(probability: float, freedom: float) -> float:
     """What chi-square of that many degrees of freedom exceeds with this probability."""
     from scipy.special import chdtri  # where it is needed: 31 MB
@@ -374,3 +402,18 @@ def chi_square(probability: float, freedom: float) -> float:
 def log_density(apart: Array, cov: Array) -> float:
     """Log-density of a difference (n,) of this covariance (n, n), up to a constant."""
     return -0.5 * (squares_of(apart, cov) + float(np.linalg.slogdet(cov)[1]))
+
+
+def log_probability(r: Array, half: float) -> tuple[Array, Array, Array]:
+    """Log-probability that a standard normal variable lies within `half` of r (N,), its derivative
+    by -r, and the negative of its second derivative."""
+    from scipy.special import log_ndtr  # where it is needed: 31 MB
+
+    upper, lower = r + half, r - half
+    # From the smaller tail: a difference of two numbers near 1 would be lost to rounding.
+    more, less = log_ndtr(half - np.abs(r)), log_ndtr(-half - np.abs(r))
+    probability = more + np.log(-np.expm1(np.minimum(less - more, -1e-300)))
+    at_upper, at_lower = (
+        np.exp(-0.5 * edge**2 - probability) / sqrt(2.0 * np.pi) for edge in (upper, lower))
+    score = at_lower - at_upper
+    return probability, score, score**2 + upper * at_upper - lower * at_lower
