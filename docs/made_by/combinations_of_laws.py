@@ -10,7 +10,7 @@ from backlash_ros.core import Estimate, Parameters, Status, build_closed_loop
 from backlash_ros.core.assembly import LAWS, STRUCTURES, law_fits
 from backlash_ros.core.estimate import was_given
 
-SAMPLES, RESTS_FROM = 1000, 300
+SAMPLES, RESTS_FROM = 1200, 500
 SEED = 5
 NOISE = 1e-7  # deviation of the noise on y [unit of y]
 LOST = 0.1  # share of the samples
