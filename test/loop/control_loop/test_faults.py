@@ -77,7 +77,7 @@ def test_reports_of_an_encoder_with_another_zero_still_teach_the_crossings_of_v(
 
 
 def test_lost_controls_that_nobody_reports_are_found_or_said_to_be_inconsistent() -> None:
-    wrong, inconsistent, far = [], [], []
+    wrong, learned, far = [], [], []
     for seed in range(1, 15):
         world = SimulatedLoop()
         world.learn()
@@ -85,21 +85,23 @@ def test_lost_controls_that_nobody_reports_are_found_or_said_to_be_inconsistent(
         world.deaf = lambda world=world: bool(world.rng.random() < 0.3)
         world.run(600)
         rows = world.rows[-600:]
-        inconsistent += [row.status is Status.INCONSISTENT for row in rows]
-        found = world.loop.core.estimator.report.reattributed
-        assert np.mean(inconsistent[-600:]) > 0.2 or found > 50
+        inconsistent = np.mean([row.status is Status.INCONSISTENT for row in rows])
+        assert inconsistent > 0.2 or world.loop.core.estimator.report.reattributed > 50
         off = np.abs([[row.m, row.c_r, row.c_l] for row in rows] - TRUTH)
         beyond = off > 5.0 * np.array([[row.std_m, row.std_c_r, row.std_c_l] for row in rows])
+        # In one of ten intervals an older command acted, which nothing explains: this matters where
+        # it moves a crossing by a hundredth of the gap.
+        matters = (off[:, 1:] > 0.01 * (TRUTH[1] - TRUTH[2])).any(axis=1)
         tracking = np.array([row.status is Status.TRACKING for row in rows])
-        wrong.append(np.mean(tracking & beyond.any(axis=1)))
-        # What is lost looks like a disturbance that walks: both crossings move, and say so. In some
-        # runs, swaps that did not happen explain as much as those that did.
+        wrong.append(np.mean(tracking & beyond.any(axis=1) & matters))
+        learned.append(tracking[-1])
+        # In some runs, swaps that did not happen explain as much as those that did.
         far.append((off / np.abs(TRUTH)).max())
         world.check_sanity()
-    assert np.sum(np.array(far) > 0.4) <= 2
-    assert max(far) < 0.8
-    assert np.mean(inconsistent) > 0.2
-    assert np.mean(wrong) < 0.05
+    assert np.sum(np.array(far) > 0.05) <= 4
+    assert max(far) < 0.3
+    assert np.mean(learned) > 0.5
+    assert np.mean(wrong) < 0.02
 
 
 @pytest.mark.parametrize('broken', ['sign', 'constant'])
