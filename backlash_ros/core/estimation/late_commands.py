@@ -3,8 +3,8 @@
 If the command that is not in the record acted, it would add s to y. With residuals r, this raises
 the log-likelihood by (s.r - s.s / 2) / sigma^2 (A. S. Willsky, H. L. Jones, IEEE Trans. Automatic
 Control 21 (1976)). Prior odds, after k of n commands were late: k + 1/2 to n - k - 1/2 (Jeffreys).
-The likeliest swap is made first, and the rest compared again, until none is likely. Two late
-commands in a short time look like one between them, so pairs are compared as well.
+The likeliest swap is made first, and the rest compared again, until none is likely; as two late
+commands soon after each other look like one between them, pairs are compared, too.
 """
 
 from collections.abc import Iterable
@@ -25,17 +25,17 @@ NEWEST = 300  # samples within which two commands are compared as a pair
 
 
 def likelier(
-    setup: Setup, record: Window, fit: WindowFit, back: frozenset[int], older: Prior | None,
+    setup: Setup, record: Window, fit: WindowFit, already: frozenset[int], older: Prior | None,
     since: int = 0,
 ) -> tuple[Window, frozenset[int]]:
     """Swap commands from sample `since` on where the other one is likelier to have acted.
 
-    back: samples swapped so far. Returns the record and all samples that are swapped in it.
+    already: samples swapped so far. Returns the record and all samples that are swapped in it.
     """
     every = np.flatnonzero(np.isfinite(record.other))
     open_, count = every[every >= since - record.first], len(every)
     if not len(open_) or fit.m <= 0.0:
-        return record, back
+        return record, already
     problem, (b, a) = setup.problem(record, older), setup.family.at(fit.xi)
     reach = settings.ROWS if setup.family.integrates else setup.family.memory
     known = problem.known.astype(np.float64)
@@ -45,8 +45,8 @@ def likelier(
     noise = max(fit.noise * (0.25 if fit.systematic else 1.0), problem.nominal,
                 problem.step_of_readings / sqrt(12.0))
     v, other = record.v.copy(), record.other.copy()
-    before = np.isin(record.first + open_, list(back))
-    swapped, settled = before.copy(), len(record.places(back)) - int(before.sum())
+    before = np.isin(record.first + open_, list(already))
+    swapped, settled = before.copy(), len(record.places(already)) - int(before.sum())
 
     def added(k: int, p: Array) -> Array:
         """Change of y if the other command acts in interval k."""
@@ -62,8 +62,7 @@ def likelier(
     pulse = lfilter(b, a, fit.m * (np.arange(reach) == 0.0))
     squares = np.correlate(np.pad(known, (0, reach - 1)), pulse**2)[open_]
     squares -= (along(q.T) ** 2).sum(axis=0)
-    tail = max(len(v) - NEWEST, 0)
-    newest = np.flatnonzero(open_ >= tail)
+    newest = np.flatnonzero(open_ >= (tail := max(len(v) - NEWEST, 0)))
     pulses = lfilter(b, a, fit.m * np.eye(len(v) - tail)[open_[newest] - tail]) * known[tail:]
     products = pulses @ pulses.T - (pulses @ q[tail:]) @ (pulses @ q[tail:]).T
 
@@ -71,7 +70,7 @@ def likelier(
         rest = residual - q @ (q.T @ residual)
         return _log_prior(settled + int(swapped.sum()), count) - 0.5 * float(rest @ rest) / noise**2
 
-    def likeliest() -> list[int]:
+    def likeliest(in_pairs: bool) -> list[int]:
         """The swap, or pair of swaps, that seems to gain most; none if none gains."""
         p, late = play(v, fit.gap, fit.p0), settled + int(swapped.sum())
         fewer, same, more = (_log_prior(k, count) for k in (max(late - 1, 0), late, late + 1))
@@ -90,7 +89,7 @@ def likelier(
         each, by = np.where(on, -inf, gains)[newest], moved[newest] / noise
         pairs = np.add.outer(each, each) - np.outer(by, by) * products
         np.fill_diagonal(pairs, gains[newest])  # one alone
-        if pairs.max(initial=-inf) > max(gains.max(), 0.0):
+        if in_pairs and pairs.max(initial=-inf) > max(gains.max(), 0.0):
             return [*map(int, newest[[*divmod(int(pairs.argmax()), len(pairs))]])]
         return [int(gains.argmax())] if gains.max() > 0.0 else []
 
@@ -102,11 +101,12 @@ def likelier(
 
     best = log_posterior()
     for _ in range(200):  # at most this many times
-        # Of three late commands two may look like one: also try to take a swap back before.
-        for taken_back in [[], *([i] for i in newest[swapped[newest]].tolist())]:
+        # A pair may gain less than it seems; one of three commands may have to be taken back first.
+        back = [([i], True) for i in newest[swapped[newest]].tolist()]
+        for taken_back, in_pairs in [([], True), ([], False), *back]:
             as_it_was = residual.copy(), v.copy(), other.copy(), swapped.copy()
             swap(taken_back)
-            swap(likeliest())
+            swap(likeliest(in_pairs))
             if log_posterior() > best + 1e-6:
                 best = log_posterior()
                 break
@@ -114,7 +114,7 @@ def likelier(
         else:
             break
     found = frozenset((record.first + open_[swapped != before]).tolist())
-    return record.swapped(found), back ^ found
+    return record.swapped(found), already ^ found
 
 
 def weighed(

@@ -47,9 +47,9 @@ def _guessed_unit(known: Array, period: float | None, said: list[str]) -> float:
     step = typical_step(known if known[-1] > known[0] else known[::-1])
     whole = step >= 1.0 and bool((known == np.round(known)).all())
     if period is None:
-        if whole and size < 1e9:  # else seconds since 1970
-            said.append('t, in whole numbers, is taken as seconds; if it counts something else: '
-                        '--period')
+        if step >= 1.0 and size < 1e9:  # else seconds since 1970
+            said.append(f't is taken as seconds, {step:.3g} from row to row; if it counts '
+                        'something else: --period')
         return 1.0
     for scale in (1e-3, 1e-6, 1e-9, 60.0):
         if abs(step * scale / period - 1.0) < 0.3:

@@ -354,3 +354,12 @@ def test_what_v_does_and_what_is_no_turn_is_kept(v: Array, y: Array) -> None:
 ])
 def test_the_step_of_a_quantised_y_is_told(y: Array, step: float) -> None:
     assert readings.quantum(y) == pytest.approx(step, rel=1e-3)
+
+
+@pytest.mark.parametrize(('scale', 'asks'), [(1e3, True), (1.0, False)])
+def test_milliseconds_with_decimals_are_not_taken_for_seconds_without_a_word(
+    scale: float, asks: bool,
+) -> None:
+    jitter = 1e-4 * PERIOD_S * np.random.default_rng(0).uniform(-1.0, 1.0, COUNT)
+    record = log(even(), stamps=scale * (even() + jitter))
+    assert ('if it counts something else: --period' in record.timing) is asks
