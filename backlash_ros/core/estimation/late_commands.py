@@ -88,7 +88,7 @@ def likelier(
         gains[moved == 0.0] = -inf
         each, by = np.where(on, -inf, gains)[newest], moved[newest] / noise
         pairs = np.add.outer(each, each) - np.outer(by, by) * products
-        np.fill_diagonal(pairs, gains[newest])  # one alone
+        np.fill_diagonal(pairs, -inf)
         if in_pairs and pairs.max(initial=-inf) > max(gains.max(), 0.0):
             return [*map(int, newest[[*divmod(int(pairs.argmax()), len(pairs))]])]
         return [int(gains.argmax())] if gains.max() > 0.0 else []
@@ -107,8 +107,8 @@ def likelier(
             as_it_was = residual.copy(), v.copy(), other.copy(), swapped.copy()
             swap(taken_back)
             swap(likeliest(in_pairs))
-            if log_posterior() > best + 1e-6:
-                best = log_posterior()
+            if (now := log_posterior()) > best + 1e-6:
+                best = now
                 break
             residual, v, other, swapped = as_it_was
         else:

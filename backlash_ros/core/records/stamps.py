@@ -45,7 +45,6 @@ def _guessed_unit(known: Array, period: float | None, said: list[str]) -> float:
             said.append(f't counts {unit} since 1970')
             return scale
     step = typical_step(known if known[-1] > known[0] else known[::-1])
-    whole = step >= 1.0 and bool((known == np.round(known)).all())
     if period is None:
         if step >= 1.0 and size < 1e9:  # else seconds since 1970
             said.append(f't is taken as seconds, {step:.3g} from row to row; if it counts '
@@ -55,7 +54,7 @@ def _guessed_unit(known: Array, period: float | None, said: list[str]) -> float:
         if abs(step * scale / period - 1.0) < 0.3:
             said.append(f't counts {seconds(scale)}')
             return scale
-    if whole and step == 1.0:
+    if step == 1.0 and (known == np.round(known)).all():
         said.append('t counts the samples')
         return period
     return 1.0
