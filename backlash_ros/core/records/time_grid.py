@@ -9,16 +9,13 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from backlash_ros.core.control.limits import LARGEST_SIGNAL
 from backlash_ros.core.loop.command_history import v_of_intervals
-from backlash_ros.core.loop.sample_counter import JITTER, numbered
 from backlash_ros.core.plant.transfer_function import Array
-from backlash_ros.core.records import readings, stamps
+from backlash_ros.core.records import readings, row_numbers, stamps
 from backlash_ros.core.records.record import Record, RecordError, counted, seconds
-
-Numbers = NDArray[np.int64]
+from backlash_ros.core.records.row_numbers import Numbers
 
 BREAK = 3.0  # periods without a row that are a break
 MOST_SAMPLES = 1_000_000  # of a grid
@@ -33,15 +30,6 @@ class Rows(NamedTuple):
     y: Array
     commands: Array | None = None
     reported: bool = False
-
-
-class Numbering(NamedTuple):
-    """Numbers of rows (M,), whose stamps are begin + period * numbers + off [s]."""
-
-    numbers: Numbers
-    period: float
-    begin: float
-    off: Array
 
 
 def record_of(
@@ -161,22 +149,23 @@ def on_grid(rows: Rows, period: float | None = None, late: bool = False) -> Reco
     rows, cut = _longest_stretch(rows, guess)
     if len(rows.t) < 2 or not np.isfinite(rows.y).any():
         raise RecordError(f'{cut}y has no readings there: choose a part with --from, --to')
-    steps = np.diff(rows.t) / guess
-    found = _numbering(rows.t, steps, guess, late)
+    found = (row_numbers.late if late else row_numbers.even)(rows.t, guess)
     used = period or found.period
     if late or (np.abs(found.off).max() <= nearly_even * guess
                 and abs(found.period / used - 1.0) <= nearly_even):
         what = 'messages of y' if late else 'rows'
         return _numbered_grid(rows, found.numbers, used,
                               f'{cut}{len(rows.t)} {what}, one every {seconds(used)}')
-    inner = steps[steps <= BREAK * max(float(np.median(steps)), 1.0)]
+    steps = np.diff(rows.t)
+    inner = steps[steps <= BREAK * max(stamps.typical_step(rows.t), guess)]
     mean = float(np.mean(inner))
     percent = f'{100.0 * float(np.std(inner)) / mean:.2g} %'
-    come = f'{cut}stamps jitter by {percent} around {seconds(mean * guess)}'
-    if period is not None:
-        found = _along(_late_numbers(rows.t / period), rows.t)
+    come = f'{cut}stamps jitter by {percent} around {seconds(mean)}'
+    found = row_numbers.likeliest(
+        rows.t, *((0.98 * period, 1.02 * period) if period else (0.75 * mean, 1.03 * mean)))
+    used = period or found.period
     # With too many rows missing, or too late, numbers would be wrong.
-    if found.numbers[-1] + 1 <= 1.3 * len(rows.t) and np.std(found.off) <= found.period and sum(
+    if found.numbers[-1] + 1 <= 1.3 * len(rows.t) and np.std(found.off) <= used and sum(
             readings.rougher(rows.t, found.numbers.astype(float), signal)
             for signal in (rows.y, rows.v) if signal.ndim == 1) > 0.05:
         return _numbered_grid(rows, found.numbers, used, f'{come}, the motion is even: rows are '
@@ -214,44 +203,6 @@ def _longest_stretch(rows: Rows, period: float) -> tuple[Rows, str]:
     cut = rows._replace(**kept)
     return cut, (f'{counted(len(ends) - 2, "long break")}: the longest stretch, {len(cut.t)} rows, '
                  'is used; ')
-
-
-def _along(numbers: Numbers, t: Array) -> Numbering:
-    period, begin = np.polyfit(numbers, t, 1).tolist()
-    return Numbering(numbers, period, begin, t - begin - period * numbers)
-
-
-def _numbering(t: Array, steps: Array, period: float, late: bool) -> Numbering:
-    """Of several ways to number the rows, the one closest to a line. steps (M - 1,): in periods."""
-    found = [_along(_late_numbers(t / period), t)]
-    if not late:
-        # Over a long record the error of a median of uneven steps adds up, so try the mean as well.
-        usual = steps[steps < 0.5 * BREAK]
-        mean = period * (float(np.mean(usual)) if usual.any() else 1.0)
-        found += [_along(numbers, t) for numbers in (
-            _risen(np.append(0.0, np.cumsum(np.round(steps)))), _late_numbers(t / mean),
-            _risen(np.round((t - t[0]) / period)))]
-        # Then each stamp rounded to the line of each numbering found so far.
-        found += [_along(_risen(np.round((t - one.begin) / one.period)), t)
-                  for one in found if one.period > 0.0]
-    found = [one for one in found if one.period > 0.0 and one.numbers[-1] < MOST_SAMPLES]
-    if not found:
-        raise RecordError('t does not rise steadily: give --period S, or cut out one motion')
-    best = min(found, key=lambda one: round(float(np.std(one.off)) / one.period, 9))
-    deviation = max(2.0 * float(np.std(best.off)), 1e-12 * period) / float(best.numbers[-1])
-    return best._replace(period=stamps.fewest_digits(best.period, deviation))
-
-
-def _late_numbers(times: Array) -> Numbers:
-    """Number times [periods] that may be late, never early; in a heap the last is the newest."""
-    return _risen(np.array(numbered(times.tolist(), 1.0, 1.0 - JITTER)))
-
-
-def _risen(numbers: Array) -> Numbers:
-    """The numbers made to rise strictly, by lowering those before the last of a heap, from 0."""
-    place = np.arange(len(numbers))
-    risen = np.minimum.accumulate((numbers - place)[::-1])[::-1] + place
-    return np.asarray(risen - risen[0], dtype=np.int64)
 
 
 def _numbered_grid(rows: Rows, index: Numbers, period: float, said: str) -> Record:

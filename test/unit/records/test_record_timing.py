@@ -82,6 +82,38 @@ def test_late_stamps_of_even_samples_are_numbered() -> None:
     assert off(record) < 1.1e-3
 
 
+@pytest.mark.parametrize('lost', [0.0, 0.01, 0.1])
+@pytest.mark.parametrize('jitter', ['normal', 'uniform', 'late'])
+@pytest.mark.parametrize('count', [300, 3000])
+def test_where_stamps_jitter_missing_rows_are_told_from_a_shorter_period(
+    count: int, jitter: str, lost: float,
+) -> None:
+    random = np.random.default_rng(count)
+    shift = {'normal': random.normal(0.0, 0.3, count), 'uniform': random.uniform(-0.5, 0.5, count),
+             'late': random.exponential(0.3, count)}[jitter]
+    kept = random.random(count) >= lost
+    kept[0] = kept[-1] = True
+    t = even(count)
+    stamps = np.maximum.accumulate(t + PERIOD_S * shift)
+    record = log(t[kept], stamps=stamps[kept])
+    assert 'rows are numbered' in record.timing
+    assert record.sample_period == pytest.approx(PERIOD_S, rel=0.5 / count)
+    # A row next to a hole may be on either side of it, the first one as well.
+    assert record.lost == pytest.approx(count - kept.sum(), abs=1 + 0.02 * count)
+    t = PERIOD_S * np.arange(len(record.y))
+    shares = [np.mean(np.abs(record.y - position(t + by * PERIOD_S))[np.isfinite(record.y)] < 6e-3)
+              for by in (-1, 0, 1)]
+    assert max(shares) > 0.93
+
+
+def test_a_period_far_below_the_steps_of_a_coarse_clock_is_kept() -> None:
+    t = np.cumsum(np.tile([0.0, 0.0, 0.5], 100))
+    slow = 1e-3 * np.arange(300)  # moves little from one equal stamp to the next
+    record = record_of(t, command(t) + slow, position(t) + slow, period=0.012)
+    assert record.sample_period == 0.012
+    assert '199 rows with equal stamps' in record.timing
+
+
 @pytest.mark.parametrize(('unit_s', 'scale', 'origin'), [
     (1e-3, 1e3, 0.0), (1e-6, 1e6, 5.0), (None, 1e9, 1.7e9), (None, 1e3, 1.7e9),
 ])
