@@ -23,7 +23,7 @@ from backlash_ros.core.jobs import Executor, Failure
 from backlash_ros.core.law import Interval, Law, LawReport
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.parameters import Bounds, Parameters
-from backlash_ros.core.plant.numerics import Gain, gains_of, response_slopes, state_after, std_of
+from backlash_ros.core.plant.numerics import Gain, gains_of, response_std, state_after, std_of
 from backlash_ros.core.plant.transfer_function import Array, StateModel, TransferFunction
 from backlash_ros.core.window import Recorder, Window
 
@@ -146,12 +146,9 @@ class MovingHorizon(Law):
             outliers=self._following.outliers, failed_fits=self._failed_fits)
 
     def response_std(self, z: NDArray[np.complex128]) -> Array:
-        fit, family = self._belief.fit, self._setup.family
-        if fit is None:
-            return np.full(len(z), nan)
-        slopes = response_slopes(family, fit.xi, z)
-        variance = np.einsum('ij,jk,ik->i', slopes, fit.cov_xi, slopes.conj()).real
-        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+        fit = self._belief.fit
+        return np.full(len(z), nan) if fit is None else response_std(
+            self._setup.family, fit.xi, fit.cov_xi, z)
 
     def adopt(self, model: StateModel) -> None:
         if model is not self._proposed.model:  # learned by the law before this one

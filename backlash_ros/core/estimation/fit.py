@@ -50,16 +50,17 @@ class Problem:
     """A record to be fitted: v and y (N,), y nan where lost, and what is known beforehand.
 
     noise_std: nominal, a weak prior. step: quantization of y, 0 for none; None to detect it.
+    knots: of a walk of u, 1 for a steady drift; 0 for as many as suit the record.
     """
 
     def __init__(
         self, family: Family, v: Array, y: Array, noise_std: float, older: Prior | None = None,
-        step: float | None = None,
+        step: float | None = None, knots: int = 0,
     ) -> None:
         self.family, self.v, self.nominal, self.strokes = family, v, noise_std, strokes_of(v)
         self.older = older or Prior(np.zeros((0, 3 + family.count)), np.zeros(0))
         self._leaks = 0 if self.older.rows[:, 3:].any() else family.leaks  # prior not counted yet
-        self.known = np.isfinite(y)
+        self.known, self._knots = np.isfinite(y), knots
         self.y = np.where(self.known, y, 0.0)
         self.step_of_readings = numerics.step_of(y) if step is None else step
         self._runs: dict[WindowFit, Run] = {}
@@ -96,7 +97,7 @@ class Problem:
     def _walk(self) -> Array:
         """Basis of d: hat functions (W, N), knots some 8 samples apart or more, 0 at the end."""
         count = len(self.v)
-        knots = min(max(count // 8, 1), 36)
+        knots = self._knots or min(max(count // 8, 1), 36)
         place = np.arange(count) * knots / max(count - 1, 1)
         return np.asarray(np.maximum(1.0 - np.abs(place - np.arange(knots)[:, None]), 0.0))
 
@@ -309,19 +310,21 @@ class Problem:
             value, rms, rho, dispersion if f.step else 1.0, count, turns, gain))
 
     def begun(self, f: WindowFit, offset: bool = False) -> WindowFit:
-        """This fit with X, and o too if `offset`, from linear least squares; f if y overflows."""
+        """This fit with X, `offset`: o and d, too, by linear least squares; f if y overflows."""
         there = replace(f, x=np.zeros(1), step=0.0)  # far from the intervals
-        run, count = self.at(there), len(self.v)
-        columns = [*numerics.state_responses(run.a, count)]
+        run, (hats, knots, _) = self.at(there), self._walk_of(f)
+        columns = [*numerics.state_responses(run.a, len(self.v))]
         if offset:
-            columns.append(lfilter(run.b, [1.0], lfilter([1.0], run.a, np.full(count, -1.0))))
+            of_u = np.vstack([*hats, np.full(len(self.v), -1.0)])
+            columns += [*lfilter(run.b, [1.0], lfilter([1.0], run.a, of_u))]
         rows = np.column_stack([*columns, run.error])[self.known]
         if not np.isfinite(rows).all():
             return f
         best = np.linalg.lstsq(rows[:, :-1], rows[:, -1], rcond=1e-12)[0]
-        theta = f.theta.copy()
-        theta[1] += best[-1] if offset else 0.0
-        return replace(f, x=best[:len(run.a) - 1], theta=theta)
+        n, theta = len(run.a) - 1, f.theta.copy()
+        if offset:
+            theta[1], knots = theta[1] + best[-1], knots + best[n:-1]
+        return replace(f, x=best[:n], knots=knots, theta=theta)
 
     def with_intervals(self, f: WindowFit) -> WindowFit:
         """The finished fit, by the interval likelihood unless noise hides the quantization."""

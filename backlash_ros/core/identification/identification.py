@@ -21,7 +21,7 @@ from backlash_ros.core.identification.model import VAGUE, Model, Structure, Unit
 from backlash_ros.core.identification.structure_search import Options, Progress, StructureSearch
 from backlash_ros.core.judgement.deviations import covariance_of, effective
 from backlash_ros.core.judgement.not_play import Observed, limited, rate_limit
-from backlash_ros.core.judgement.verdict import CERTAIN, Findings, Verdict, judge
+from backlash_ros.core.judgement.verdict import CERTAIN, WORTH_A_WORD, Findings, Verdict, judge
 from backlash_ros.core.plant.actuator import Actuator
 from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.records import readings
@@ -116,8 +116,7 @@ def identify(
     v, y = np.asarray(v, dtype=float), np.asarray(y, dtype=float)
     readings.check_record(v, y)
     part = readings.busiest(v, y)
-    nothing = _why_nothing(v, y[part], options)
-    if nothing:
+    if nothing := _why_nothing(v, y[part], options):
         return Identification(sample_period, v, y, refused=nothing)
     slow = rate_limit(v[part], y[part])
     if slow is not None:
@@ -135,8 +134,7 @@ def identify(
     # Rivals differ in the delay alone and fit about as well.
     best = models.least_response(best, [
         one.whole for one in s.compared if one.whole.behind(best, rows) <= search.PLATEAU
-        and one.structure != best.structure == replace(
-            one.structure, delay=best.structure.delay)])
+        and one.structure != best.structure == replace(one.structure, delay=best.structure.delay)])
     longer = len(v) > len(samples.v)
     if longer:
         whole = y.copy()
@@ -155,9 +153,14 @@ def identify(
         first=part.start + s.held_out.first))
     progress('judging')
     found = _as_a_gain(_described(s, given, options), s, options)
-    return found if slow is None else found.with_remarks(
+    remarks = [] if slow is None else [
         f'v jumps, and the drive follows at {slow / sample_period:.4g} per s at most: the fit is '
-        'to v with this limit, which is control.rate_max in the file', *found.remarks)
+        'to v with this limit, which is control.rate_max in the file']
+    drift = units.v_size * float(best.fit.knots.sum())
+    if abs(drift) > WORTH_A_WORD * found.gap:
+        remarks.append(f'c_r and c_l drift by {drift:.2g} over the record, or y does: at its end '
+                       'they are as given')
+    return found.with_remarks(*remarks, *found.remarks)
 
 
 def _why_nothing(v: Array, y: Array, options: Options) -> str:
@@ -199,15 +202,16 @@ def _described(s: StructureSearch, given: Identification, options: Options) -> I
     best, structure, units = s.best, s.best.structure, s.samples.units
     covariance = covariance_of(best.problem, best.fit)
     c_r, (gap_var, c_r_var, c_l_var) = _crossings(best, covariance, units)
-    g = models.response_of(best, covariance, units.y_size / units.v_size)
+    unit = units.y_size / units.v_size
+    g, numerator = models.response_of(best, covariance, unit), unit * best.numerator
     low, high = readings.frequencies_of(best.run.y)
     low = max(low, np.pi / len(best.run.y))
     frequencies = np.geomspace(low, max(high, 1.01 * low), 60, dtype=np.float64)
     spread, gain_std = g.std(frequencies), float(g.std(np.zeros(1))[0])
     middle, still = np.sqrt(frequencies[:1] * frequencies[-1:]), _still(best)
     delays = tuple(sorted({*search.equal_delays(s.compared, s.chosen), structure.delay}))
-    observed, total = search.observed_of(s.samples, best), float(g.numerator.sum())
-    static = total if structure.integrator else total / float(g.denominator.sum())
+    observed, total = search.observed_of(s.samples, best), float(numerator.sum())
+    static = total if structure.integrator else total / (1.0 + float(best.a.sum()))
     # If no structure explains y, likelihoods say little: all that predict about as well count
     # alike, and the median of their distances withstands a single odd one.
     alike = search.predictors(s.compared) if observed.unexplained else []
@@ -229,7 +233,7 @@ def _described(s: StructureSearch, given: Identification, options: Options) -> I
         std={'m': options.slope * gain_std, 'gap': verdict.gap_std,
              'c_r': sqrt(max(c_r_var + more, 0.0)), 'c_l': sqrt(c_l_var + more)},
         model=FoundModel(
-            tuple((g.numerator / options.slope).tolist()),
+            tuple((numerator / options.slope).tolist()),
             (*best.denominator.tolist(), *[0.0] * at_zero), structure.delay, delays,
             structure.integrator, frequencies, spread, _as_parameter(2.0 * float(spread.max())),
             units.y_size * sqrt(best.squares / max(len(best.left) - structure.unknowns, 1)),

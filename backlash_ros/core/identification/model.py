@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 from backlash_ros.core.estimation.fit import STEPS, Problem
 from backlash_ros.core.estimation.posterior import Prior, WindowFit
 from backlash_ros.core.judgement.deviations import covariance_of, effective
+from backlash_ros.core.plant import numerics
 from backlash_ros.core.plant.backlash import play
-from backlash_ros.core.plant.numerics import is_stable, lfilter, padded, shifted, steiglitz_mcbride
+from backlash_ros.core.plant.numerics import is_stable, lfilter, padded, shifted
 from backlash_ros.core.plant.transfer_function import Array
 
 VAGUE = 1e3  # prior standard deviation of a coefficient, in scaled units
@@ -79,27 +80,25 @@ class Structure:
 class Units(NamedTuple):
     """Offset and scale of v and of y, by which a record is centred and scaled."""
 
-    v: float
-    v_size: float
-    y: float
-    y_size: float
-
-
-ALREADY = Units(0.0, 1.0, 0.0, 1.0)  # for signals that are centred and scaled already
+    v: float = 0.0
+    v_size: float = 1.0
+    y: float = 0.0
+    y_size: float = 1.0
 
 
 @dataclass(frozen=True)
 class Samples:
     """A record (N,), centred and scaled, y nan where lost; y is fitted over [first, last).
     step: quantization step of y if rounding dominates the residual, so that equal readings share
-    one error; else 0."""
+    one error; else 0. drifts: whether u has a steady drift."""
 
     v: Array
     y: Array
     first: int
     last: int
     step: float
-    units: Units = ALREADY
+    units: Units
+    drifts: bool = False
 
     @property
     def fitted_y(self) -> Array:
@@ -109,7 +108,8 @@ class Samples:
         held = 1e6  # weight that holds m at 1: the gain is in B
         begin, y = self.first - 1 - structure.delay, self.fitted_y
         prior = Prior(held * np.eye(1, 3 + structure.count), np.full(1, held))
-        return Problem(structure, self.v[begin:begin + len(y)], y, 1e-12, prior, step=self.step)
+        return Problem(structure, self.v[begin:begin + len(y)], y, 1e-12, prior,
+                       self.step, int(self.drifts))
 
 
 @dataclass(eq=False)
@@ -148,15 +148,14 @@ class Model:
         """Initial values for another fit: these, with the gap and p0 if given, and a zero state."""
         theta = self.fit.theta.copy()
         theta[2] = self.gap if gap is None else gap
-        return WindowFit(
-            np.zeros(1), self.fit.p0 if p0 is None else p0, theta, self.fit.noise_std)
+        return WindowFit(np.zeros(1), self.fit.p0 if p0 is None else p0, theta,
+                         self.fit.noise_std, self.fit.knots, self.fit.walk_std)
 
     def begin_with_pole(self, pole: float, structure: Structure) -> WindowFit:
         """Initial values for `structure`, one order higher: a zero cancels the additional pole."""
         b, a = (np.asarray(np.convolve(one, (1.0, -pole)), dtype=float)
                 for one in (self.numerator, np.append(1.0, self.a)))
-        return replace(self.begin(), theta=np.append(
-            self.fit.theta[:3], structure.xi(b, a[1:])))
+        return replace(self.begin(), theta=np.append(self.fit.theta[:3], structure.xi(b, a[1:])))
 
 
 def fitted(
@@ -169,7 +168,8 @@ def fitted(
     for begin in begins:
         problem = samples.problem(structure)
         # Readings are values here, not intervals, and never without noise.
-        fit = replace(begin, step=0.0, noise_std=max(begin.noise_std, 1e-12))
+        fit = replace(begin, step=0.0, noise_std=max(begin.noise_std, 1e-12),
+                      walk_std=VAGUE * samples.drifts)
         with suppress(np.linalg.LinAlgError):  # without a finite posterior it stays as it began
             fit = problem.fitted(fit, steps, least_gain)
         found.append(Model(structure, problem, fit))
@@ -181,49 +181,45 @@ def first_model(samples: Samples, structure: Structure, gap: float, p0: float) -
     problem, taps, count = samples.problem(structure), structure.numerator_taps, \
         len(samples.fitted_y)
     known = problem.known
-    moves = np.vstack([play(problem.v, gap, p0), np.ones(count)])
+    slow = [np.ones(count), np.linspace(1.0, 0.0, count)][:1 + samples.drifts]
+    moves = np.vstack([play(problem.v, gap, p0), *slow])
 
     def follows(a: Array) -> Array:
         # Only the free poles multiply y; an integrator divides all that y follows.
         whole = np.asarray(np.convolve(a, (1.0, -1.0))) if structure.integrator else a
-        moved, constant = lfilter([1.0], whole, moves)
+        moved, *constant = lfilter([1.0], whole, moves)
         of_state = shifted(lfilter([1.0], whole, np.eye(1, count)[0]), structure.states)
-        return np.vstack([shifted(moved, taps), constant, of_state])
+        return np.vstack([shifted(moved, taps), *constant, of_state])
 
     y, found = np.interp(np.arange(count), np.flatnonzero(known), problem.y[known]), []
-    for a, weights in steiglitz_mcbride(y, follows, structure.free_poles, known):
+    for a, weights in numerics.steiglitz_mcbride(y, follows, structure.free_poles, known):
         b, gain = weights[:taps], float(weights[:taps].sum())
-        offset = -float(weights[taps]) / gain if gain else 0.0
-        theta = np.concatenate([[1.0, offset, gap], structure.xi(b, a[1:])])
-        found.append(Model(structure, problem, WindowFit(weights[taps + 1:], p0, theta, 1.0)))
+        offset, *drift = weights[taps:taps + len(slow)] / gain if gain else np.zeros(len(slow))
+        theta = np.concatenate([[1.0, -offset, gap], structure.xi(b, a[1:])])
+        found.append(Model(structure, problem, WindowFit(
+            weights[taps + len(slow):], p0, theta, 1.0, np.array(drift), VAGUE * samples.drifts)))
     return min(found)
 
 
 class Response(NamedTuple):
-    """Frequency response of m G without its delay. denominator: 1 and a, to be multiplied by
-    1 - 1/z if `integrator`. covariance: of B and a."""
+    """Frequency response of m G without its delay. covariance: of xi (K, K). unit: scale of y over
+    that of v."""
 
-    numerator: Array
-    denominator: Array
-    integrator: bool
+    structure: Structure
+    xi: list[float]
     covariance: Array
+    unit: float
 
     def at(self, frequencies: Array) -> NDArray[np.complex128]:
         """Complex response at frequencies [rad/sample]."""
         back = np.exp(-1j * np.asarray(frequencies))
-        value = back * polyval(back, self.numerator) / polyval(back, self.denominator)
-        return np.asarray(value / (1.0 - back) if self.integrator else value)
+        b, a = self.structure.at(self.xi)
+        return np.asarray(self.unit * back * polyval(back, b) / polyval(back, a))
 
     def std(self, frequencies: Array) -> Array:
         """Relative standard deviation at frequencies [rad/sample], shape (N,)."""
-        back = np.exp(-1j * np.asarray(frequencies, dtype=float))
-        free, top = polyval(back, self.denominator), polyval(back, self.numerator)
-        # Derivatives of log(m G): z^-i / B with respect to b_i, -z^-j / A to a_j.
-        jacobian = np.array([
-            *(back**i / top for i in range(len(self.numerator))),
-            *(-back**j / free for j in range(1, len(self.denominator)))]).T
-        variance = np.einsum('ni,ij,nj->n', jacobian, self.covariance, jacobian.conj()).real
-        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+        z = np.exp(1j * np.maximum(frequencies, 1e-6))  # an integrator cancels, but not at 0
+        return numerics.response_std(self.structure, self.xi, self.covariance, z)
 
     @property
     def known_up_to(self) -> float:
@@ -234,12 +230,8 @@ class Response(NamedTuple):
 
 def response_of(found: Model, covariance: Array | None = None, unit: float = 1.0) -> Response:
     """Response of a model with this covariance of theta. unit: scale of y over that of v."""
-    if covariance is None:
-        covariance = np.zeros((3 + found.structure.count,) * 2)
-    scale = np.append(np.full(found.structure.numerator_taps, unit * VAGUE),
-                      np.full(found.structure.free_poles, VAGUE))
-    return Response(unit * found.numerator, np.append(1.0, found.a), found.structure.integrator,
-                    covariance[3:, 3:] * np.outer(scale, scale))
+    of_xi = np.zeros((found.structure.count,) * 2) if covariance is None else covariance[3:, 3:]
+    return Response(found.structure, found.fit.xi, of_xi, unit)
 
 
 def least_response(best: Model, rivals: Sequence[Model] = ()) -> Model:

@@ -94,6 +94,9 @@ def searched(
     units, samples = record.units, replace(
         record, first=max(delays) + 1, last=len(record.v), step=step_of(record.y))
     found = _with_general(samples, delays)
+    drifting = _with_general(replace(samples, drifts=True), delays)
+    if drifting[0].behind(found[0], effective(drifting[0].left)) < -PLATEAU:
+        samples, found = replace(samples, drifts=True), drifting
     kept = without_outliers(samples, found[0])
     # If the residual exceeds the quantization step, rounding does not dominate it.
     kept = replace(kept, step=samples.step * (found[0].rms <= samples.step))

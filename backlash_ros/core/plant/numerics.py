@@ -93,6 +93,13 @@ def response_slopes(
     return np.asarray(powers_of_z @ db.T / of_b[:, None] - powers_of_z @ da.T / of_a[:, None])
 
 
+def response_std(family: Family, xi: list[float], cov: Array, z: NDArray[np.complex128]) -> Array:
+    """Relative std of G(z; xi) at the points z (M,), for the covariance of xi (K, K)."""
+    slopes = response_slopes(family, xi, z)
+    variance = np.einsum('ij,jk,ik->i', slopes, cov, slopes.conj()).real
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+
 def multiplied(*factors: Sequence[complex]) -> list[complex]:
     """Product of polynomials; with so few coefficients faster than np.convolve."""
     result = [1.0 + 0j]

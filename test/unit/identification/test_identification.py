@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 
 from backlash_ros.core.control.motion import strokes
 from backlash_ros.core.identification.identification import Identification, identify
-from backlash_ros.core.identification.model import Samples, Structure, first_model, fitted
+from backlash_ros.core.identification.model import Samples, Structure, Units, first_model, fitted
 from backlash_ros.core.identification.structure_search import Options
 from backlash_ros.core.plant.backlash import play
 
@@ -113,10 +113,22 @@ def test_a_y_that_is_read_every_few_samples_alone_is_enough(every: int) -> None:
     assert found.std['gap'] < 0.02
 
 
+@pytest.mark.parametrize('rise', [0.1, -0.6])
+def test_a_drift_of_y_is_no_part_of_the_gap_and_is_told(rise: float) -> None:
+    v, y = record()
+    found = identify(v, y + np.linspace(0.0, rise, len(y)), PERIOD_S, QUICK)
+    assert found.reasons == ()
+    assert abs(found.gap - 0.9) < 4.0 * found.std['gap'] < 0.004
+    # G has a gain of 1; a drift of y instead of u comes some samples earlier.
+    assert found.c_r == pytest.approx(0.5 - rise, abs=3e-3)
+    assert found.model.denominator == pytest.approx((1.0, -1.7, 0.755), abs=0.01)
+    assert any(remark.startswith(f'c_r and c_l drift by {-rise:.2g} ') for remark in found.remarks)
+
+
 def test_a_first_model_leads_to_the_true_one() -> None:
     v, y = record(noise=0.0, gap=0.9137)
     structure = Structure(2, 1, False)
-    samples = Samples(v, y, 3, len(v), 0.0)
+    samples = Samples(v, y, 3, len(v), 0.0, Units())
     begin = first_model(samples, structure, 0.6, float(v[2]) + 0.3)
     found = fitted(samples, structure, begin.fit)
     assert found.gap == pytest.approx(0.9137, abs=1e-6)

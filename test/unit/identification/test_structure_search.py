@@ -15,7 +15,7 @@ from backlash_ros.core.identification.identification import identify
 from backlash_ros.core.judgement.deviations import by_model, covariance_of
 from backlash_ros.core.plant.backlash import play
 
-STILL, SWUNG = (models.Samples(v, np.full(len(v), np.nan), 1, len(v), 0.0)
+STILL, SWUNG = (models.Samples(v, np.full(len(v), np.nan), 1, len(v), 0.0, models.Units())
                 for v in (np.zeros(2), np.sin(0.1 * np.arange(300.0))))
 # Strokes, what a play makes of them, and noise.
 V = np.array(list(islice(strokes(-2.0, 2.0, 8.0, 0.02, 20.0, 0.0), 1000)))
@@ -103,7 +103,8 @@ def test_a_delay_beyond_those_that_are_compared_first_is_found() -> None:
 def std_of_gap(noise: np.ndarray) -> tuple[float, float]:
     v = np.sin(0.05 * np.arange(len(noise)))
     y = lfilter([0.0, 0.3], [1.0, -0.7], play(v, 0.3, 0.1)) + noise
-    samples, structure = models.Samples(v, y, 1, len(v), 0.0), models.Structure(1, 0, False)
+    samples = models.Samples(v, y, 1, len(v), 0.0, models.Units())
+    structure = models.Structure(1, 0, False)
     found = models.fitted(samples, structure, models.first_model(samples, structure, 0.25, 0.1).fit)
     matrix = covariance_of(found.problem, found.fit)
     return matrix[2, 2] ** 0.5, found.fit.cov[2, 2] ** 0.5
@@ -124,7 +125,7 @@ def test_models_that_fit_alike_tell_a_deviation_and_others_none() -> None:
 
 def test_a_fit_that_leaves_more_than_y_itself_is_taken_only_where_all_do() -> None:
     v = np.zeros(50)
-    samples = models.Samples(v, np.sin(np.arange(50.0)), 1, 50, 0.0)
+    samples = models.Samples(v, np.sin(np.arange(50.0)), 1, 50, 0.0, models.Units())
     structures = [models.Structure(0, 0, False), models.Structure(1, 0, False)]
     still, off = (models.Model(one, samples.problem(one), WindowFit(
         np.zeros(1), 0.0, np.concatenate([[1.0, offset, 1.0], one.xi(np.ones(1), np.zeros(
