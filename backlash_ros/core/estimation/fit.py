@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimation import posterior
 from backlash_ros.core.estimation.posterior import Prior, WindowFit
-from backlash_ros.core.plant import numerics
+from backlash_ros.core.plant import numerics, quantized
 from backlash_ros.core.plant.backlash import Region, engaged, play, reversals, strokes_of
 from backlash_ros.core.plant.numerics import lfilter, padded, sensitivities, shifted, triangle
 from backlash_ros.core.plant.transfer_function import Array, Family
@@ -32,7 +32,7 @@ STEPS, FIRST_STEPS, FEW_STEPS = 16, 6, 3  # limits on the number of Gauss-Newton
 class Run(NamedTuple):
     """A record simulated with the values of a fit: G = b / a; play output p, then u and y, (N,).
 
-    error: readings minus y (N,), 0 where lost. weights, number: see `posterior.independence`.
+    error: readings minus y (N,), 0 where lost. weights, number: see `quantized.independence`.
     """
 
     b: list[float]
@@ -41,7 +41,7 @@ class Run(NamedTuple):
     u: Array
     y: Array
     error: Array
-    likelihood: posterior.Likelihood
+    likelihood: quantized.Likelihood
     weights: Array
     number: NDArray[np.intp]
 
@@ -62,7 +62,7 @@ class Problem:
         self._leaks = 0 if self.older.rows[:, 3:].any() else family.leaks  # prior not counted yet
         self.known, self._knots = np.isfinite(y), knots
         self.y = np.where(self.known, y, 0.0)
-        self.step_of_readings = numerics.step_of(y) if step is None else step
+        self.step_of_readings = quantized.step_of(y) if step is None else step
         self._runs: dict[WindowFit, Run] = {}
 
     def at(self, f: WindowFit) -> Run:
@@ -74,8 +74,9 @@ class Problem:
             b, a = self.family.at(f.xi)
             y = lfilter(b, a, u, padded(f.x, len(a) - 1))
             error = (self.y - y) * self.known
-            weights, number = posterior.independence(self.y, self.known, y, self.step_of_readings)
-            likelihood = posterior.likelihood(error, f.noise_std, f.step, weights)
+            weights, number = quantized.independence(
+                self.y, self.known, y, self.step_of_readings, inf if f.step else f.noise_std)
+            likelihood = quantized.likelihood(error, f.noise_std, f.step, weights)
             run = Run(b, a, p, u, y, error, likelihood, weights, number)
             self._runs = dict([*self._runs.items(), (f, run)][-3:])
         return self._runs[f]
@@ -284,7 +285,7 @@ class Problem:
         free = max(float(run.weights.sum()) - len(f.x) - len(f.knots) - 4.0, 0.0)
         squares = (run.weights * run.error) @ run.error + self.nominal**2
         out = replace(f, noise_std=sqrt(squares / (free + 1.0)))
-        likelihood = posterior.likelihood(run.error, out.noise_std, 0.0, run.weights)
+        likelihood = quantized.likelihood(run.error, out.noise_std, 0.0, run.weights)
         self._runs[out] = run._replace(likelihood=likelihood)
         return out
 

@@ -1,70 +1,18 @@
-"""The likelihood of readings of y, and the result of a fit: values, posterior, evidence.
-
-A reading is normally distributed around the output. If it is quantized with step delta, it says
-that output plus noise (standard deviation sigma) lies within half a step of it (L. Y. Wang et al.,
-System Identification with Quantized Observations, Birkhaeuser 2010):
-
-    P(y | output) = [Phi((r + delta/2) / sigma) - Phi((r - delta/2) / sigma)] / delta
-    r = y - output
-"""
+"""The result of a fit: values, posterior, evidence; and the error of G that it leaves open."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from math import inf, log, nan, pi, sqrt
+from math import inf, nan, sqrt
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.settings import CHANCE
-from backlash_ros.core.plant.numerics import chi_square, log_probability, squares_of
+from backlash_ros.core.plant.numerics import chi_square, squares_of
 from backlash_ros.core.plant.transfer_function import Array
 
 SCALES = np.asarray(np.geomspace(3e-4, 10.0, 14), np.float64)  # grid of s
-
-
-class Likelihood(NamedTuple):
-    """For each reading (N,): log-density, score (derivative of that by the output), information."""
-
-    log_density: Array
-    score: Array
-    information: Array
-
-
-def likelihood(r: Array, noise_std: float, step: float, weights: Array) -> Likelihood:
-    """Likelihood of readings with residuals r and weights, both (N,); step 0: not quantized."""
-    if not step:
-        density = -0.5 * (r / noise_std) ** 2 - log(sqrt(2.0 * pi) * noise_std)
-        return Likelihood(density, r / noise_std**2, np.full(len(r), noise_std**-2))
-    probability, score, curvature = log_probability(r / noise_std, 0.5 * step / noise_std)
-    # Each gets at least the mean information, or unknowns could stay undetermined; the sum is kept.
-    total = weights @ curvature + 1e-9  # positive even if no reading says anything
-    information = np.maximum(curvature, total / (weights.sum() + 1e-9))
-    information *= total / (weights @ information + 1e-9)
-    return Likelihood(probability - log(step), score / noise_std, information / noise_std**2)
-
-
-def independence(
-    y: Array, known: NDArray[np.bool_], output: Array, step: float,
-) -> tuple[Array, NDArray[np.intp]]:
-    """Weights (N,) that count repeated readings once, and the group of each known reading (K,)."""
-    # If the output passes a place in the same way again with the same reading, quantization errors
-    # repeat. If readings there differ, only equal ones in a row repeat an error.
-    same_place = 16  # parts of a step; outputs within one part are at the same place
-    weights = known.astype(np.float64)
-    if not step or not known.any():
-        return weights, np.arange(int(weights.sum()))
-    read, places = y[known], np.floor(output[known] * (same_place / step))
-    row = np.cumsum(np.append(0, (np.diff(read) != 0.0) | (np.diff(places) != 0.0)))
-    moves = np.diff(places, prepend=places[:1], append=places[-1:])
-    # A way: a place, the moves to and from it. Irrational weights make its sum unique.
-    _, first, way = np.unique(places + sqrt(2.0) * moves[:-1] + sqrt(3.0) * moves[1:],
-                              return_index=True, return_inverse=True)
-    differ = np.bincount(way, np.abs(read - read[first[way]])) > 0.5 * step
-    number = np.where(differ[way], row, row[first[way]])
-    weights[known] = 1.0 / np.bincount(number)[number]
-    return weights, number
 
 
 class Prior(NamedTuple):

@@ -23,7 +23,7 @@ from backlash_ros.core.identification.model import Model, Samples, Structure, fi
 from backlash_ros.core.judgement.deviations import by_model, effective
 from backlash_ros.core.judgement.not_play import Observed, best_other
 from backlash_ros.core.judgement.verdict import ANOTHER
-from backlash_ros.core.plant.numerics import step_of
+from backlash_ros.core.plant.quantized import step_of
 from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.records.readings import noise_of, outliers, quantum
 

@@ -1,4 +1,4 @@
-"""Filters and their fit, Riccati and Lyapunov equations, gains, poles, noise, normal densities.
+"""Filters and their fit, Riccati and Lyapunov equations, gains, poles, noise, covariances.
 
 lfilter is not that of scipy.signal, which costs 0.3 s and 40 MB; scipy.linalg (31 MB) loads late.
 Reference: E. K.-W. Chu et al., Structure-preserving algorithms for periodic discrete-time algebraic
@@ -344,27 +344,6 @@ class NoiseLevel:
         insort(self._sorted, size)
 
 
-def step_of(y: Array) -> float:
-    """The quantization step, of which all differences of readings (N,) are multiples; 0 if none.
-
-    It needs no repeated readings, but all their digits.
-    """
-    even = 1e-3  # tolerance of that, in steps
-    different = np.unique(y[np.isfinite(y)])
-    if len(different) < 8:  # distinct readings needed to tell a step
-        return 0.0
-    apart = np.diff(different)
-    apart = apart[apart > even * np.median(apart)]  # not floating-point errors
-    step = float(apart.min())
-    for _ in range(4):  # Euclid's algorithm, as none may be a single step apart in a fast motion
-        left = np.abs(apart - step * np.round(apart / step))
-        left = left[left > even * step]
-        if not left.size:
-            return step
-        step = float(left.min())
-    return 0.0
-
-
 def isolated(flags: NDArray[np.bool_], known: NDArray[np.intp], most: float, run: int) -> \
         NDArray[np.bool_]:
     """Return flags (N,) without runs of `run` or more of the known samples (K,); none at all if
@@ -409,18 +388,3 @@ def chi_square(probability: float, freedom: float) -> float:
 def log_density(apart: Array, cov: Array) -> float:
     """Log-density of a difference (n,) of this covariance (n, n), up to a constant."""
     return -0.5 * (squares_of(apart, cov) + float(np.linalg.slogdet(cov)[1]))
-
-
-def log_probability(r: Array, half: float) -> tuple[Array, Array, Array]:
-    """Log-probability that a standard normal variable lies within `half` of r (N,), its derivative
-    by -r, and the negative of its second derivative."""
-    from scipy.special import log_ndtr  # where it is needed: 31 MB
-
-    upper, lower = r + half, r - half
-    # From the smaller tail: a difference of two numbers near 1 would be lost to rounding.
-    more, less = log_ndtr(half - np.abs(r)), log_ndtr(-half - np.abs(r))
-    probability = more + np.log(-np.expm1(np.minimum(less - more, -1e-300)))
-    at_upper, at_lower = (
-        np.exp(-0.5 * edge**2 - probability) / sqrt(2.0 * np.pi) for edge in (upper, lower))
-    score = at_lower - at_upper
-    return probability, score, score**2 + upper * at_upper - lower * at_lower

@@ -9,7 +9,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.settings import GATE, OUTLIER_SHARE
-from backlash_ros.core.plant.numerics import step_of
+from backlash_ros.core.plant.quantized import step_of
 from backlash_ros.core.plant.transfer_function import Array
 
 Flags = NDArray[np.bool_]

@@ -11,11 +11,12 @@ from backlash_ros.core.estimation.explanations import Setup, afresh
 from backlash_ros.core.estimation.fit import Problem
 from backlash_ros.core.estimation.late_commands import weighed
 from backlash_ros.core.estimation.plant_family import PlantFamily
-from backlash_ros.core.estimation.posterior import WindowFit, independence, likelihood
+from backlash_ros.core.estimation.posterior import WindowFit
 from backlash_ros.core.estimation.search import search
 from backlash_ros.core.parameters import Bounds, Parameters
 from backlash_ros.core.plant.backlash import play
 from backlash_ros.core.plant.numerics import RATIOS, gain_of, lfilter
+from backlash_ros.core.plant.quantized import independence, likelihood
 from backlash_ros.core.plant.simulated_plant import altered_plant
 from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
 from backlash_ros.core.window import Window
@@ -133,7 +134,7 @@ def test_what_is_unexplained_does_not_depend_on_the_unit_of_y() -> None:
 def test_readings_that_repeat_one_rounding_count_as_one() -> None:
     y, known = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 9.0]), np.arange(6) < 5
     weights, number = independence(y, known, np.full(6, 1.2), 1.0)
-    assert weights == pytest.approx([1 / 3] * 3 + [0.5] * 2 + [0.0])
+    assert weights == pytest.approx([0.4] * 5 + [0.0])  # two rows of equal ones
     assert number.tolist() == [0, 0, 0, 1, 1]
     assert independence(y, known, 0.1 * np.arange(6), 1.0)[0].tolist() == known.tolist()
 
@@ -149,6 +150,35 @@ def test_a_motion_that_is_repeated_repeats_its_rounding_unless_noise_makes_it_di
     assert independence(noisy, known, output, 1.0)[0].sum() > 25
     moved = output + np.repeat(0.1 * np.arange(5), 6)
     assert independence(np.round(moved), known, moved, 1.0)[0].tolist() == [1.0] * 30
+
+
+def test_rare_readings_of_a_stay_count_no_more_than_the_others() -> None:
+    y = np.where(np.arange(200) % 10 == 3, 1.0, 0.0)
+    for noise_std in (np.inf, 0.4, 0.3):
+        weights, _ = independence(y, np.full(200, True), np.full(200, 0.4), 1.0, noise_std)
+        assert weights @ y / weights.sum() == pytest.approx(0.1)
+    # Little noise leaves the same rounding error to all of them, however many there are.
+    assert weights.sum() < 3.0
+
+
+@pytest.mark.parametrize('noise', [0.06, 0.15, 0.3])
+def test_noise_that_spreads_readings_at_rest_over_two_steps_shifts_no_gap(noise: float) -> None:
+    errors = []
+    for seed in range(6):
+        rng, step, pieces, x = np.random.default_rng(seed), 0.02, [np.zeros(1)], 0.0
+        for goal in rng.uniform(-3.0, 3.0, 14):
+            pieces += [np.linspace(x, goal, int(abs(goal - x) / 0.02) + 2), np.full(200, goal)]
+            x = goal
+        v = np.concatenate(pieces)
+        y = lfilter([0.3], [1.0, -0.7], play(v, 1.0, 0.5) - 0.5) \
+            + noise * step * rng.standard_normal(len(v))
+        problem = Problem(PlantFamily(TransferFunction([0.3], [1.0, -0.7]), 0.0), v,
+                          step * np.round(y / step), 1e-4)
+        begin = WindowFit(np.zeros(1), 0.5, np.array([1.0, 0.5, 1.0]), 1e-3)
+        found = problem.with_intervals(problem.finished(problem.fitted(begin)))
+        assert found.step
+        errors.append(found.gap - 1.0)
+    assert np.sqrt(np.mean(np.square(errors))) < 5e-4
 
 
 INTEGRATOR = PlantFamily(TransferFunction([0.0, 0.1], [1.0, -1.0]), 0.0)

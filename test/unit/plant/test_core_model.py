@@ -15,7 +15,8 @@ from strategies import output_of, plants
 
 from backlash_ros.core.assembly import build_controller, takes_model_as_exact, warnings_of
 from backlash_ros.core.parameters import ParameterError, Parameters
-from backlash_ros.core.plant.numerics import lfilter, lyapunov, riccati, step_of
+from backlash_ros.core.plant.numerics import lfilter, lyapunov, riccati
+from backlash_ros.core.plant.quantized import step_of
 from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
 
 
