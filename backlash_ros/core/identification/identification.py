@@ -143,8 +143,8 @@ def identify(
         begin = best.begin(p0=float(v[0]) + 0.5 * best.gap)
         best = fitted(samples, best.structure, begin, steps=FIRST_STEPS)
     # A reading that was an outlier to the first model need not be one to the best.
-    kept = search.without_outliers(replace(samples, y=y), best)
-    if not np.array_equal(kept.y, samples.y, equal_nan=True):
+    kept = search.cleaned(replace(samples, y=y), best)
+    if kept.step != samples.step or not np.array_equal(kept.y, samples.y, equal_nan=True):
         samples = kept
         best = models.least_response(fitted(samples, best.structure, best.fit))
     elif longer:

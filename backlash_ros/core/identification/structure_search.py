@@ -91,15 +91,12 @@ def searched(
 ) -> StructureSearch:
     """Find the best structure with one of these delays for the whole record."""
     progress('searching the gap')
-    units, samples = record.units, replace(
-        record, first=max(delays) + 1, last=len(record.v), step=step_of(record.y))
+    units, samples = record.units, replace(record, first=max(delays) + 1, last=len(record.v))
     found = _with_general(samples, delays)
     drifting = _with_general(replace(samples, drifts=True), delays)
     if drifting[0].behind(found[0], effective(drifting[0].left)) < -PLATEAU:
         samples, found = replace(samples, drifts=True), drifting
-    kept = without_outliers(samples, found[0])
-    # If the residual exceeds the quantization step, rounding does not dominate it.
-    kept = replace(kept, step=samples.step * (found[0].rms <= samples.step))
+    kept = cleaned(samples, found[0])
     if kept.y is not samples.y or kept.step != samples.step:
         samples = kept
         found = sorted(fitted(samples, one.structure, one.fit) for one in found)
@@ -171,14 +168,16 @@ def _of_gaps(samples: Samples, like: Model) -> list[Model]:
     return sorted(models)
 
 
-def without_outliers(samples: Samples, found: Model) -> Samples:
-    """The samples without outliers, and without readings repeated once although the model moves."""
-    y, simulated = samples.fitted_y, found.run.y
+def cleaned(samples: Samples, found: Model) -> Samples:
+    """The samples without outliers, and without readings repeated once although the model moves;
+    with the quantization step, unless the residual exceeds it: then rounding does not dominate."""
+    y, simulated, step_of_y = samples.fitted_y, found.run.y, step_of(samples.y)
     step = quantum(y)
     same = np.append(False, np.diff(y) == 0.0)
     alone = same & ~np.append(False, same[:-1]) & ~np.append(same[1:], False)
     moves = np.abs(np.diff(simulated, prepend=simulated[0]))
     wild = outliers(y - simulated, step) | alone & (moves > max(step, 0.5 * found.rms))
+    samples = replace(samples, step=step_of_y * (found.rms <= step_of_y))
     if not wild.any():
         return samples
     y = samples.y.copy()
