@@ -133,3 +133,26 @@ def test_a_fit_that_leaves_more_than_y_itself_is_taken_only_where_all_do() -> No
     good, bad = compared(still, 1.0, -10.0), compared(off, 0.1, 50.0)
     assert search.selected([good, bad]) is good
     assert search.selected([bad]) is bad
+
+
+def gaps_of_moves_with_rests(noise: float, seed: int) -> tuple[float, float, float]:
+    """Quantization step that counts, and the gap by a fit without and with it; noise in steps."""
+    rng, step, pieces, x = np.random.default_rng(seed), 0.004, [np.zeros(1)], 0.0
+    for goal in rng.uniform(-6.0, 6.0, 8):
+        pieces += [np.linspace(x, goal, int(abs(goal - x) / 0.008) + 2), np.full(800, goal)]
+        x = goal
+    v = np.concatenate(pieces)
+    y = lfilter([0.0, 0.05], [1.0, -0.95], play(v, 0.9, 0.45) - 0.5)
+    y = step * np.round(y / step + noise * rng.standard_normal(len(v)))
+    samples = models.Samples(v, y, 1, len(v), 0.0, models.Units())
+    structure = models.Structure(1, 0, False)
+    found = models.fitted(samples, structure, models.first_model(samples, structure, 0.8, 0.4).fit)
+    kept = search.cleaned(samples, found)
+    return kept.step, found.gap, models.fitted(kept, structure, found.fit).gap
+
+
+def test_the_readings_of_a_rest_share_one_rounding_unless_noise_hides_it() -> None:
+    steps, without, weighed = np.transpose([gaps_of_moves_with_rests(0.05, k) for k in range(4)])
+    assert steps == pytest.approx(0.004)
+    assert np.abs(weighed - 0.9).mean() < 0.3 * np.abs(without - 0.9).mean() < 3e-4
+    assert gaps_of_moves_with_rests(2.0, 0)[0] == 0.0
