@@ -169,7 +169,8 @@ class IdealTrajectory:
         """Use this plan of a design from the next sample on; softness: its index."""
         self.design, self.softness, self._plan = design, softness, design.plans[softness]
         self.references.noise_gains = self._plan.noise_gains
-        self._due: Array | None = None  # u* ahead at the next sample, without its reference
+        self._due: list[float] | None = None  # u* ahead at the next sample, without its reference
+        self._of_newest: list[float] = self._plan.references[:, -1].tolist()
         self._transition: list[tuple[list[float], float]] = list(
             zip(design.model.a.tolist(), design.model.b.tolist(), strict=True))
 
@@ -208,7 +209,7 @@ class IdealTrajectory:
         z = np.linalg.matrix_power(plan.closed, steps) @ start + np.einsum(
             'kij,kj->i', powers(plan.closed, inputs, steps), pairs)
         self.x, self.q = z[:n].tolist(), float(z[n])
-        self.ahead = self._ahead(self.references.window).tolist()
+        self.ahead = self._ahead(self.references.window)
 
     def begin(self, r: float) -> None:
         """Begin at rest with y = r."""
@@ -223,11 +224,12 @@ class IdealTrajectory:
 
     def take(self, y_m: float) -> None:
         """Take in y_m as r(k + N), and compute u* for this sample and those ahead."""
-        references, r, gains = self.references, float(y_m), self._plan.references[:, -1]
+        references, r = self.references, float(y_m)
         due = self._ahead(references.window[1:]) if self._due is None else self._due
         references.append(r)
         self.spread = max(references.high, r) - min(references.low, r) - references.noise_spread
-        self.ahead = (due + gains * r).tolist()
+        # Without NumPy, whose first calls after a pause cost the command several microseconds.
+        self.ahead = [u + gain * r for u, gain in zip(due, self._of_newest, strict=True)]
 
     def turn(self, noise_std: float, gap_u: float, band: float, crossing: float) -> bool:
         """Decide on which side v is to be at this sample; return whether the side has changed.
@@ -312,10 +314,10 @@ class IdealTrajectory:
         self.references.settle()
         self._due = self._ahead(self.references.window[1:])
 
-    def _ahead(self, references: Array) -> Array:
+    def _ahead(self, references: Array) -> list[float]:
         """Return u* for this sample and those ahead, by [x*; q*] and these references."""
         gains = self._plan.references[:, :len(references)]
-        ahead: Array = self._plan.states @ [*self.x, self.q] + gains @ references
+        ahead: list[float] = (self._plan.states @ [*self.x, self.q] + gains @ references).tolist()
         return ahead
 
 
