@@ -158,8 +158,8 @@ def identify(
         'to v with this limit, which is control.rate_max in the file']
     drift = units.v_size * float(best.fit.knots.sum())
     if abs(drift) > WORTH_A_WORD * found.gap:
-        remarks.append(f'c_r and c_l drift by {drift:.2g} over the record, or y does: at its end '
-                       'they are as given')
+        remarks.append(f'c_r and c_l drift by {drift:.2g} over the record, or y drifts: given are '
+                       'those at its end')
     return found.with_remarks(*remarks, *found.remarks)
 
 
