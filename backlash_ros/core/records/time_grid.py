@@ -150,6 +150,8 @@ def on_grid(rows: Rows, period: float | None = None, late: bool = False) -> Reco
     if len(rows.t) < 2 or not np.isfinite(rows.y).any():
         raise RecordError(f'{cut}y has no readings there: choose a part with --from, --to')
     found = (row_numbers.late if late else row_numbers.even)(rows.t, guess)
+    if not found.period > 0.0 or found.numbers[-1] >= MOST_SAMPLES:
+        raise RecordError('t does not rise steadily: give --period S, or cut out one motion')
     used = period or found.period
     if late or (np.abs(found.off).max() <= nearly_even * guess
                 and abs(found.period / used - 1.0) <= nearly_even):

@@ -288,6 +288,12 @@ def test_stamps_without_sense_are_told(t: list[float], said: str) -> None:
         record_of(stamps, stamps + 1.0, stamps)
 
 
+def test_a_stretch_of_one_stamp_is_refused() -> None:
+    stamps, motion = np.append(np.zeros(50), 1e6 + np.arange(21.0)), np.sin(0.3 * np.arange(71))
+    with pytest.raises(RecordError, match='t does not rise steadily: give --period S'):
+        record_of(stamps, motion, np.roll(motion, 1))
+
+
 T = 0.005 * np.arange(3000)
 MOTION = np.sin(3.0 * T) + 0.2 * np.sin(7.0 * T)
 SQUARE = np.where(np.sin(3.0 * T) > 0.0, 360.0, 0.0)
