@@ -48,6 +48,15 @@ def swing(count: int, size: float = 3.0, seed: int = 0) -> Array:
         np.sin(2.0 * np.pi * f * t + rng.uniform(0.0, 2.0 * np.pi)) for f in (0.7, 1.9, 3.7))
 
 
+def moves_with_rests(goals: Array, pace: float, rest: int) -> Array:
+    """v from 0 to each goal, by `pace` a sample at most, with so many samples of rest there."""
+    pieces, x = [np.zeros(1)], 0.0
+    for goal in goals.tolist():
+        pieces += [np.linspace(x, goal, int(abs(goal - x) / pace) + 2), np.full(rest, goal)]
+        x = goal
+    return np.concatenate(pieces)
+
+
 def output(
     model: TransferFunction, v: Array, truth: Truth, noise_std: float = 0.0, seed: int = 0,
 ) -> Array:

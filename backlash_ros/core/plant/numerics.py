@@ -83,19 +83,13 @@ def sensitivities(family: Family, xi: list[float], u: Array, y: Array) -> Array:
     return np.asarray(of_b @ shifted(u, taps) - of_a @ shifted(y, taps))
 
 
-def response_slopes(
-    family: Family, xi: list[float], z: NDArray[np.complex128],
-) -> NDArray[np.complex128]:
-    """Derivatives of ln G(z; xi) by each xi at the points z (M,), shape (M, K)."""
+def response_std(family: Family, xi: list[float], cov: Array, z: NDArray[np.complex128]) -> Array:
+    """Relative std of G(z; xi) at the points z (M,), for the covariance of xi (K, K)."""
     db, da = family.slopes(xi)
     powers_of_z = 1.0 / z[:, None] ** np.arange(db.shape[1])
     of_b, of_a = (powers_of_z[:, :len(x)] @ np.array(x) for x in family.at(xi))
-    return np.asarray(powers_of_z @ db.T / of_b[:, None] - powers_of_z @ da.T / of_a[:, None])
-
-
-def response_std(family: Family, xi: list[float], cov: Array, z: NDArray[np.complex128]) -> Array:
-    """Relative std of G(z; xi) at the points z (M,), for the covariance of xi (K, K)."""
-    slopes = response_slopes(family, xi, z)
+    # Derivatives of ln G by each xi (M, K).
+    slopes = powers_of_z @ db.T / of_b[:, None] - powers_of_z @ da.T / of_a[:, None]
     variance = np.einsum('ij,jk,ik->i', slopes, cov, slopes.conj()).real
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from records import resonance
+from records import moves_with_rests, resonance
 from scipy.optimize import least_squares
 from scipy.signal import cont2discrete
 from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR
@@ -165,11 +165,8 @@ def test_rare_readings_of_a_stay_count_no_more_than_the_others() -> None:
 def test_noise_that_spreads_readings_at_rest_over_two_steps_shifts_no_gap(noise: float) -> None:
     errors = []
     for seed in range(6):
-        rng, step, pieces, x = np.random.default_rng(seed), 0.02, [np.zeros(1)], 0.0
-        for goal in rng.uniform(-3.0, 3.0, 14):
-            pieces += [np.linspace(x, goal, int(abs(goal - x) / 0.02) + 2), np.full(200, goal)]
-            x = goal
-        v = np.concatenate(pieces)
+        rng, step = np.random.default_rng(seed), 0.02
+        v = moves_with_rests(rng.uniform(-3.0, 3.0, 14), 0.02, 200)
         y = lfilter([0.3], [1.0, -0.7], play(v, 1.0, 0.5) - 0.5) \
             + noise * step * rng.standard_normal(len(v))
         problem = Problem(PlantFamily(TransferFunction([0.3], [1.0, -0.7]), 0.0), v,

@@ -5,6 +5,7 @@ from itertools import islice
 
 import numpy as np
 import pytest
+from records import moves_with_rests
 from scipy.signal import lfilter
 
 from backlash_ros.core.control.motion import strokes
@@ -137,11 +138,8 @@ def test_a_fit_that_leaves_more_than_y_itself_is_taken_only_where_all_do() -> No
 
 def gaps_of_moves_with_rests(noise: float, seed: int) -> tuple[float, float, float]:
     """Quantization step that counts, and the gap by a fit without and with it; noise in steps."""
-    rng, step, pieces, x = np.random.default_rng(seed), 0.004, [np.zeros(1)], 0.0
-    for goal in rng.uniform(-6.0, 6.0, 8):
-        pieces += [np.linspace(x, goal, int(abs(goal - x) / 0.008) + 2), np.full(800, goal)]
-        x = goal
-    v = np.concatenate(pieces)
+    rng, step = np.random.default_rng(seed), 0.004
+    v = moves_with_rests(rng.uniform(-6.0, 6.0, 8), 0.008, 800)
     y = lfilter([0.0, 0.05], [1.0, -0.95], play(v, 0.9, 0.45) - 0.5)
     y = step * np.round(y / step + noise * rng.standard_normal(len(v)))
     samples = models.Samples(v, y, 1, len(v), 0.0, models.Units())
