@@ -59,7 +59,7 @@ class Law:
     adapting: bool = True  # whether it learns, or only tracks the state of G
 
     @property
-    def x_hat(self) -> Sequence[float] | Array:
+    def x_hat(self) -> Sequence[float]:
         """State of G given y(..k) in the coordinates of StateModel, shape (n,); () without one."""
         return ()
 
@@ -71,8 +71,11 @@ class Law:
     def update(self, y: float | None, interval: Interval) -> None:
         """Process y(k), None if it was lost, and what was applied from k-1 to k."""
 
+    def prepare(self) -> None:
+        """Do the work for the next update that the command of this sample need not wait for."""
+
     def refine(self) -> None:
-        """Do the work that the command of this sample need not wait for."""
+        """Begin or take up work that takes longer than a sample."""
 
     @property
     def u_hat(self) -> float:

@@ -104,12 +104,19 @@ class AdaptiveController:
         self._newest = v, y_m, u_d
         return ControlStep(y_m, y, u_d, v, estimate)
 
+    def prepare(self) -> None:
+        """Do the work for the next sample that the command of this one need not wait for."""
+        self.structure.prepare()
+        self.estimator.prepare()
+        if self._serial is not None:
+            self._serial.observer.prepare()
+
     def refine(self) -> None:
         """Do work that the command need not wait for: adopt a better G or refine the estimates.
 
         May be left out if time is short.
         """
-        self.structure.prepare()
+        self.prepare()
         redesign = self.redesign
         gains = None if redesign is None else redesign.due(
             self.estimator.proposal, self.structure, self._serial)

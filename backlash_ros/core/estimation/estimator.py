@@ -189,6 +189,10 @@ class MovingHorizon(Law):
         if status is not self.estimate.status:
             self.estimate = replace(self.estimate, status=status)
 
+    def prepare(self) -> None:
+        if self._following.before is not None:
+            self._following.before.prepare()
+
     def refine(self) -> None:
         channel, following, setup = self._channel, self._following, self._setup
         if channel.busy:

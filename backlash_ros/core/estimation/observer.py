@@ -13,7 +13,6 @@ from collections import deque
 from collections.abc import Sequence
 from functools import partial
 from math import isnan, nan
-from operator import mul
 from typing import NamedTuple
 
 import numpy as np
@@ -23,7 +22,7 @@ from backlash_ros.core.estimation.settings import GATE, OUTLIERS, ROWS
 from backlash_ros.core.law import Interval
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.plant.backlash import clamp, play
-from backlash_ros.core.plant.numerics import RATIOS, Gain, gain_of, state_after
+from backlash_ros.core.plant.numerics import RATIOS, Gain, dot, gain_of, state_after
 from backlash_ros.core.plant.transfer_function import Array, StateModel, TransferFunction
 
 
@@ -55,7 +54,7 @@ class Observer:
     @property
     def state(self) -> list[float]:
         """x in the coordinates of StateModel, (n,)."""
-        return [sum(map(mul, row, self._x)) for row in self._to_state]
+        return [dot(row, self._x) for row in self._to_state]
 
     def place(self, x: Array, known: bool) -> None:
         """Set the state (in observer form); if it is `known`, continue with the smallest gain."""
@@ -120,7 +119,7 @@ class Following:
     def x_hat(self) -> list[float]:
         if self.observer is not None:
             return self.observer.state
-        return [0.0] * self.model.order if self.before is None else [*map(float, self.before.x_hat)]
+        return [0.0] * self.model.order if self.before is None else self.before.x_hat
 
     def change_model(self, model: StateModel, gains: Sequence[Gain]) -> None:
         self.model, self._gains = model, gains

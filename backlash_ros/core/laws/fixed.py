@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from math import nan
+from math import inf, nan
 
 import numpy as np
 
 from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.law import Interval, Law
 from backlash_ros.core.plant.backlash import clamp
-from backlash_ros.core.plant.numerics import NoiseLevel
+from backlash_ros.core.plant.numerics import NoiseLevel, dot
 from backlash_ros.core.plant.transfer_function import Array, StateModel
 
 
@@ -29,59 +29,79 @@ class FixedBacklash(Law):
     ) -> None:
         self.estimate = replace(
             initial, std_m=0.0, std_c_r=0.0, std_c_l=0.0, status=Status.TRACKING)
-        n = model.order
-        self._model, self._doubt = model, doubt
+        self._doubt, n = doubt, model.order
+        self._b: list[float] = model.b.tolist()
+        self._c = model.c
         self._transition = np.eye(n + 1)
         self._transition[:n, :n], self._transition[:n, n] = model.a, model.b
+        # x is advanced without NumPy, whose first calls after a pause take long.
+        self._rows: list[list[float]] = self._transition.tolist()
         self._noise_std, self._noise = max(noise_std, 1e-12), NoiseLevel()
-        self._x: Array = np.zeros(n + 1)
+        self._x, self._u, self._started = [0.0] * (n + 1), 0.0, False
+        # Covariances of x (n + 1, n + 1): after the newest sample and, without the change of d,
+        # before the next one; of that and y (n + 1,). They do not depend on y(k).
         self._p: Array = np.zeros((n + 1, n + 1))
-        self._u, self._started = 0.0, False
+        self._p_ahead, self._cross = self._p.copy(), [0.0] * (n + 1)
+        # Change of d, and the variance of y(k), inf if it was lost; None: they are in _p.
+        self._newest: tuple[float, float] | None = None
 
     def with_model(self, model: StateModel) -> FixedBacklash:
+        self.prepare()
         return FixedBacklash(self.estimate, model, self._noise_var**0.5, self._doubt)
 
     @property
     def u_hat(self) -> float:
-        return self._u + float(self._x[-1])
+        return self._u + self._x[-1]
 
     @property
     def _noise_var(self) -> float:
         return max(self._noise.std, self._noise_std) ** 2
 
     @property
-    def x_hat(self) -> Array:
+    def x_hat(self) -> list[float]:
         return self._x[:-1]
 
     @property
     def x_cov(self) -> Array:
+        self.prepare()
         return self._p[:-1, :-1]
 
     def predicted(self, u: float) -> float:
         """Prediction of y(k+1) if the backlash puts out this u."""
-        return self._model.c * float(self._transition[0] @ self._x + self._model.b[0] * u)
+        return self._c * (dot(self._rows[0], self._x) + self._b[0] * u)
 
     def update(self, y: float | None, interval: Interval) -> None:
+        self.prepare()
         e, v, before = self.estimate, interval.v, self._u
-        self._u = clamp(before, e.m * (v - e.c_r), e.m * (v - e.c_l))
-        x = self._transition @ self._x
-        x[:-1] += self._model.b * self._u
-        p = self._transition @ self._p @ self._transition.T
-        p[-1, -1] += (self._doubt * (self._u - before)) ** 2
-        self.innovation = nan
+        self._u = u = clamp(before, e.m * (v - e.c_r), e.m * (v - e.c_l))
+        x = [dot(row, self._x) for row in self._rows]
+        for i, b in enumerate(self._b):
+            x[i] += b * u
+        self._x, self.innovation, noise_var, variance = x, nan, self._noise_var, inf
         if y is not None:
             if not self._started:
                 # A prior that is wide compared with the first output and the noise.
-                x_scale = 1e3 * (abs(y) + self._noise_var**0.5)
-                p[:-1, :-1] += x_scale**2 * np.eye(len(x) - 1)
+                wide = 1e3 * (abs(y) + noise_var**0.5)
+                self._p_ahead[:-1, :-1] += wide**2 * np.eye(len(self._b))
+                self._cross = (self._c * self._p_ahead[:, 0]).tolist()
                 self._started = True
-            c = self._model.c
-            cross = c * p[:, 0]
-            variance = c * cross[0] + self._noise_var
-            self.innovation = y - c * float(x[0])
+            variance = self._c * self._cross[0] + noise_var
+            self.innovation = innovation = y - self._c * x[0]
+            for i, cross in enumerate(self._cross):
+                x[i] += cross / variance * innovation
+        self._newest = self._doubt * (u - before), variance
+
+    def prepare(self) -> None:
+        if self._newest is None:
+            return
+        (change, variance), self._newest, p = self._newest, None, self._p_ahead
+        p[-1, -1] += change**2
+        if variance < inf:
+            # In Joseph's form, which stays positive however wide the prior is beside the noise.
+            gain, kept = np.array(self._cross) / variance, np.eye(len(p))
+            kept[:, 0] -= self._c * gain
+            p = kept @ p @ kept.T + self._noise_var * np.outer(gain, gain)
             self._noise.take(self.innovation)
-            gain = cross / variance
-            x = x + gain * self.innovation
-            p -= np.outer(gain, cross)
-            p = 0.5 * (p + p.T)
-        self._x, self._p = x, p
+        self._p = 0.5 * (p + p.T)
+        self._p_ahead = self._transition @ self._p @ self._transition.T
+        self._cross = (self._c * self._p_ahead[:, 0]).tolist()

@@ -29,7 +29,6 @@ from backlash_ros.core.laws.input_reconstruction import (
     InputReconstruction,
 )
 from backlash_ros.core.parameters import Bounds, Parameters
-from backlash_ros.core.plant.transfer_function import Array
 
 STROKE = 8  # samples before and after u(k) over which u must move in one direction
 
@@ -50,8 +49,9 @@ class LaggedLaw(Law):
         self._agreement = Agreement()
 
     @property
-    def x_hat(self) -> Array:
-        return self._reconstruction.x_hat
+    def x_hat(self) -> list[float]:
+        x: list[float] = self._reconstruction.x_hat.tolist()
+        return x
 
     def update(self, y: float | None, interval: Interval) -> None:
         """Process y(k) and learn from the sample that the reconstruction has reached."""

@@ -372,7 +372,7 @@ class JointLoops:
         """Do the work that the next commands of these joints then need not wait for."""
         self.counter.sender.learn()
         for joint in joints:
-            self.by_name[joint].core.structure.prepare()
+            self.by_name[joint].core.prepare()
         if (loop := next(self._turns)) is not None:
             loop.core.refine()
 

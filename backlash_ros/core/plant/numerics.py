@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 from math import sqrt
+from operator import mul
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -53,6 +54,12 @@ def lfilter(
     band = np.repeat([poles], count, axis=0).T
     solved, _ = lapack.dtbtrs(band, y.reshape(-1, count).T, uplo='L', diag='U', overwrite_b=1)
     return np.ascontiguousarray(solved.T).reshape(y.shape)
+
+
+def dot(a: Sequence[float], b: Sequence[float]) -> float:
+    """Inner product of two states: for so few numbers faster than NumPy."""
+    product: float = sum(map(mul, a, b))
+    return product
 
 
 def padded(x: Array, length: int) -> Array:

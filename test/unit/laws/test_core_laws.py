@@ -11,10 +11,11 @@ from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR, KnownInput, eighths, 
 from backlash_ros.core.assembly import build_controller, build_plant, build_reference
 from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.law import Interval
+from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.laws.input_reconstruction import InputReconstruction
 from backlash_ros.core.laws.lms_and_printed import PrintedLaw, printed_c, printed_f, printed_m
 from backlash_ros.core.parameters import ParameterError, Parameters
-from backlash_ros.core.plant.transfer_function import TransferFunction
+from backlash_ros.core.plant.transfer_function import StateModel, TransferFunction
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 
 SMALL = eighths(-80, 80)
@@ -125,3 +126,16 @@ def test_lag_shorter_than_the_delay_of_the_plant_is_refused() -> None:
         InputReconstruction(model, 0.0, 3)
     assert refusal.value.name == 'estimator.lag'
     InputReconstruction(model, 0.0, 5)
+
+
+@pytest.mark.parametrize('start', [1.0, 1e4])
+def test_state_of_g_is_found_however_large_y_is_beside_its_noise(start: float) -> None:
+    model, noise_std = StateModel(TransferFunction([0.1, 0.05], [1.0, -1.5, 0.6, -0.05])), 1e-3
+    law = FixedBacklash(Estimate(1.0, 0.0, 0.0, 0.0), model, noise_std, 0.1)
+    rng, x = np.random.default_rng(5), model.equilibrium * start
+    u = ((x - model.a @ x) @ model.b) / (model.b @ model.b)  # holds y at start
+    for k in range(60):
+        law.update(model.c * x[0] + noise_std * rng.normal(), Interval(u, 0.0, 0.0))
+        off, std = np.abs(law.x_hat - x), np.sqrt(law.x_cov.diagonal())
+        assert (off < 5.0 * std + 1e-14 * start).all(), k
+        x = model.a @ x + model.b * u

@@ -15,7 +15,6 @@ Reference: M. Tomizuka, Optimal continuous finite preview problem, IEEE Trans. A
 from collections.abc import Sequence
 from functools import lru_cache
 from math import inf
-from operator import mul
 from typing import NamedTuple
 
 import numpy as np
@@ -210,12 +209,6 @@ def feedback_around(
 def power_gain(model: TransferFunction, frequency: float) -> float:
     """|G|^2 at a frequency [rad/sample]."""
     return float(abs(model.response(np.array([np.exp(1j * frequency)]))[0])) ** 2
-
-
-def dot(a: Sequence[float], b: Sequence[float]) -> float:
-    """Inner product of two states: for so few numbers faster than NumPy."""
-    product: float = sum(map(mul, a, b))
-    return product
 
 
 def _agreed(model: StateModel, gain: Gain, length: int) -> tuple[Array, Array]:

@@ -18,10 +18,11 @@ import numpy as np
 
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.structure import LARGEST_FEEDBACK, LARGEST_IN_ACQUISITION
-from backlash_ros.core.control.tracking.design import SOFTEST, TrackingDesign, dot, variances
+from backlash_ros.core.control.tracking.design import SOFTEST, TrackingDesign, variances
 from backlash_ros.core.control.tracking.trajectory import IdealTrajectory
 from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.plant.backlash import GAP, LEFT, RIGHT, Region
+from backlash_ros.core.plant.numerics import dot
 from backlash_ros.core.plant.transfer_function import Array
 
 TRUSTED_AFTER = 40  # samples for which an estimate has to hold before it gets full feedback
@@ -161,12 +162,12 @@ class StateFeedback:
         self._quiet = next((i for i, std in enumerate(noise.u_std) if std <= most),
                            len(noise.u_std) - 1)
 
-    def deviation(self, x_hat: Sequence[float] | Array, x: Sequence[float]) -> list[float]:
+    def deviation(self, x_hat: Sequence[float], x: Sequence[float]) -> list[float]:
         """Return x_hat - x*, or zeros while x_hat cannot be known."""
         if self.state.blind_for:
             self.state.blind_for -= 1
             return [0.0] * len(x)
-        return [float(x_hat[i]) - each for i, each in enumerate(x)]
+        return [x_hat[i] - each for i, each in enumerate(x)]
 
     def u(self, error: Sequence[float], held_back: bool, largest: float) -> tuple[float, float]:
         """Return the feedback to subtract from u*, and how much of it is worth crossing the gap.

@@ -16,7 +16,7 @@ from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import TrackingWeights
 from backlash_ros.core.plant.backlash import GAP, LEFT, RIGHT, Region
 from backlash_ros.core.plant.numerics import NoiseLevel
-from backlash_ros.core.plant.transfer_function import Array, StateModel
+from backlash_ros.core.plant.transfer_function import StateModel
 
 FADING = 0.8  # per sample, of HandOver.added
 
@@ -52,8 +52,8 @@ class Tracking(ControlStructure):
         self._noise_std, self._y_noise = noise_std, NoiseLevel()
         self._moves = deque([0.0], maxlen=100)  # sizes of the newest moves of v
         self._engaged_for = 0  # samples since v has crossed the gap
-        # y, the covariance of x_hat and its source at the newest command, for `prepare`.
-        self._newest: tuple[float, Array | None, Law] | None = None
+        # y and the source of x_hat at the newest command, for `prepare`.
+        self._newest: tuple[float, Law] | None = None
 
     @property
     def may_change(self) -> bool:
@@ -118,7 +118,7 @@ class Tracking(ControlStructure):
         y_m, y, estimate, source, limits = inputs
         self.prepare()
         plan, feedback, rest, hand_over = self.trajectory, self.feedback, self.rest, self.hand_over
-        first, x_cov = plan.references.empty, source.x_cov
+        first = plan.references.empty
         if first:
             # If y differs from y_m by noise only, begin at y_m: a loop at rest stays at rest.
             plan.begin(y_m if abs(y - y_m) <= OFF * self._noise_std else y)
@@ -149,12 +149,12 @@ class Tracking(ControlStructure):
         u_d += added
         before = rest.mode
         mode = rest.decide(y, self._noise_std, plan, deviation,
-                           None if x_cov is None else feedback.noise.x_std, inverse.side,
+                           feedback.noise.x_std if feedback.noise.x_known else None, inverse.side,
                            feedback.pull_back, abs(correction) > noise)
         steps = mode.steps
         if steps and mode is not before:
             rest.target = inverse.extreme, 0.0  # stay where v is
-        if steps and x_cov is not None:
+        if steps and feedback.noise.x_known:
             rest.step(estimate, plan, feedback.pull_back(deviation), inverse, mode is not before)
         side = self._side(turned, u_d, noise, inverse)
         # However u_d was made, it stays this close to what the reference asks for.
@@ -170,18 +170,18 @@ class Tracking(ControlStructure):
         crosses = inverse.taking_up or inverse.side is not side_before
         self._engaged_for = 0 if crosses else self._engaged_for + 1
         feedback.integrate(plan.design.model.c * plan.x[0] - y, inverse.limited)
-        self._newest = y, x_cov, source
+        self._newest = y, source
         return u_d
 
     def prepare(self) -> None:
         """Prepare the next sample, unless that has been done already."""
         if self._newest is not None:
-            y, x_cov, source = self._newest
+            y, source = self._newest
             self._newest = None
             self._y_noise.take(y)
             self._noise_std = max(self.feedback.y_std, self._y_noise.std)
             self.trajectory.prepare()
-            self.feedback.prepare(x_cov, self._noise_std, *self.trajectory.noise)
+            self.feedback.prepare(source.x_cov, self._noise_std, *self.trajectory.noise)
             if self.feedback.trust.full and self.trajectory.soften(self.feedback.gap_u):
                 self._change_trajectory(source)
 

@@ -11,9 +11,9 @@ from math import ceil, dist, inf, isnan, nan
 
 import numpy as np
 
-from backlash_ros.core.control.tracking.design import TrackingDesign, dot, parabolas
+from backlash_ros.core.control.tracking.design import TrackingDesign, parabolas
 from backlash_ros.core.plant.backlash import GAP, RIGHT, Region
-from backlash_ros.core.plant.numerics import NoiseLevel
+from backlash_ros.core.plant.numerics import NoiseLevel, dot
 from backlash_ros.core.plant.transfer_function import Array, powers
 
 # Fraction of m (c_r - c_l) by which u has to be off at the end of a move to be worth a crossing: a
