@@ -7,11 +7,13 @@ The likeliest swap is made first, and the rest compared again, until none is lik
 commands soon after each other look like one between them, pairs are compared, too.
 """
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import replace
 from math import exp, inf, sqrt
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from backlash_ros.core.estimation import settings
 from backlash_ros.core.estimation.explanations import Setup, afresh, apart
@@ -24,6 +26,114 @@ from backlash_ros.core.window import Window
 NEWEST = 300  # samples within which two commands are compared as a pair
 
 
+class Acting(NamedTuple):
+    """Which command acts in each interval: v and the other one (N,), residuals of y (N,), and which
+    of the open intervals are swapped (M,)."""
+
+    v: Array
+    other: Array
+    residual: Array
+    swapped: NDArray[np.bool_]
+
+
+class OpenIntervals:
+    """The intervals of a record, from sample `since` on, in which another command may have acted.
+
+    at: their indices (M,). newest: which of them are compared as pairs. start: with the commands
+    `already` swapped. Of residuals only what the unknowns of the fit cannot explain counts.
+    """
+
+    def __init__(
+        self, setup: Setup, record: Window, fit: WindowFit, already: frozenset[int],
+        older: Prior | None, since: int = 0,
+    ) -> None:
+        every = np.flatnonzero(np.isfinite(record.other))
+        self.at, self._count = every[every >= since - record.first], len(every)
+        problem, self._fit = setup.problem(record, older), fit
+        self._reach = settings.ROWS if setup.family.integrates else setup.family.memory
+        self._known, self._plant = problem.known.astype(np.float64), setup.family.at(fit.xi)
+        self._q = basis(problem.jacobian(fit) * self._known[:, None])
+        # Correlated residuals are mostly due to the very commands that are looked for.
+        self._noise = max(fit.noise * (0.25 if fit.systematic else 1.0), problem.nominal,
+                          problem.step_of_readings / sqrt(12.0))
+        swapped = np.isin(record.first + self.at, list(already))
+        self.start = Acting(record.v, record.other, problem.at(fit).error, swapped)
+        self._settled = len(record.places(already)) - int(swapped.sum())
+        # Most swaps move p in one interval only: their effect is that of a unit pulse, scaled.
+        pulse = self._moved(np.eye(1, self._reach)[0])
+        self._squares = np.correlate(np.pad(self._known, (0, self._reach - 1)), pulse**2)[self.at]
+        self._squares -= (self._along(self._q.T) ** 2).sum(axis=0)
+        begin = max(len(record.v) - NEWEST, 0)
+        self.newest = np.flatnonzero(self.at >= begin)
+        pulses = self._moved(np.eye(len(record.v) - begin)[self.at[self.newest] - begin])
+        pulses, q = pulses * self._known[begin:], self._q[begin:]
+        self._products = pulses @ pulses.T - (pulses @ q) @ (pulses @ q).T
+
+    def log_posterior(self, acting: Acting) -> float:
+        rest = self._unexplained(acting)
+        return self._log_prior(acting) - 0.5 * float(rest @ rest) / self._noise**2
+
+    def swapped(self, acting: Acting, places: Sequence[int]) -> Acting:
+        """The same with the other command in these of the open intervals."""
+        v, other = acting.v.copy(), acting.other.copy()
+        residual, swapped = acting.residual.copy(), acting.swapped.copy()
+        for i in places:
+            k = int(self.at[i])
+            residual[k:k + self._reach] -= self._added(k, v, other, self._play(v))
+            v[k], other[k], swapped[i] = other[k], v[k], not swapped[i]
+        return Acting(v, other, residual, swapped)
+
+    def likeliest(self, acting: Acting, in_pairs: bool) -> list[int]:
+        """The swap, or pair of swaps, that seems to gain most; none if none gains."""
+        v, other, _, swapped = acting
+        at, q, reach, gap, p = self.at, self._q, self._reach, self._fit.gap, self._play(v)
+        rest = self._unexplained(acting)
+        swap_to = np.clip(np.append(self._fit.p0, p[:-1])[at], other[at], other[at] + gap)
+        moved, after = swap_to - p[at], np.minimum(at + 1, len(v) - 1)
+        gains = moved * self._along(rest) - 0.5 * moved**2 * self._squares
+        on = np.clip(swap_to, v[after], v[after] + gap) != p[after]  # whether later p change, too
+        for i in np.flatnonzero((moved != 0.0) & on):
+            k = int(at[i])
+            seen = self._added(k, v, other, p)
+            explained = q[k:k + reach].T @ seen
+            gains[i] = seen @ rest[k:k + reach] - 0.5 * (seen @ seen - explained @ explained)
+        fewer, same, more = (self._log_prior(acting, change) for change in (-1, 0, 1))
+        gains = gains / self._noise**2 + np.where(swapped, fewer, more) - same
+        gains[moved == 0.0] = -inf
+        each, by = np.where(on, -inf, gains)[self.newest], moved[self.newest] / self._noise
+        pairs = np.add.outer(each, each) - np.outer(by, by) * self._products
+        np.fill_diagonal(pairs, -inf)
+        if in_pairs and pairs.max(initial=-inf) > max(gains.max(), 0.0):
+            return [*map(int, self.newest[[*divmod(int(pairs.argmax()), len(pairs))]])]
+        return [int(gains.argmax())] if gains.max() > 0.0 else []
+
+    def _play(self, v: Array) -> Array:
+        return play(v, self._fit.gap, self._fit.p0)
+
+    def _moved(self, p: Array) -> Array:
+        """Change of y by this change of p, both (..., N)."""
+        b, a = self._plant
+        return lfilter(b, a, self._fit.m * p)
+
+    def _along(self, values: Array) -> Array:
+        """Sums of values (..., N) times what a unit pulse of p in each interval adds to y."""
+        return self._moved(values[..., ::-1])[..., ::-1][..., self.at]
+
+    def _added(self, k: int, v: Array, other: Array, p: Array) -> Array:
+        """Change of y if the other command acts in interval k."""
+        end = k + self._reach
+        acting = np.append(other[k], v[k + 1:end])
+        moved = play(acting, self._fit.gap, float(p[k - 1]) if k else self._fit.p0) - p[k:end]
+        return self._moved(moved) * self._known[k:end]
+
+    def _unexplained(self, acting: Acting) -> Array:
+        return acting.residual - self._q @ (self._q.T @ acting.residual)
+
+    def _log_prior(self, acting: Acting, change: int = 0) -> float:
+        late = self._settled + int(acting.swapped.sum()) + change
+        return _log_prior(max(late, 0), self._count)
+
+
 def likelier(
     setup: Setup, record: Window, fit: WindowFit, already: frozenset[int], older: Prior | None,
     since: int = 0,
@@ -32,88 +142,24 @@ def likelier(
 
     already: samples swapped so far. Returns the record and all samples that are swapped in it.
     """
-    every = np.flatnonzero(np.isfinite(record.other))
-    open_, count = every[every >= since - record.first], len(every)
-    if not len(open_) or fit.m <= 0.0:
+    if not np.isfinite(record.between(since).other).any() or fit.m <= 0.0:
         return record, already
-    problem, (b, a) = setup.problem(record, older), setup.family.at(fit.xi)
-    reach = settings.ROWS if setup.family.integrates else setup.family.memory
-    known = problem.known.astype(np.float64)
-    q = basis(problem.jacobian(fit) * known[:, None])
-    residual = problem.at(fit).error.copy()
-    # Correlated residuals are mostly due to the very commands that are looked for.
-    noise = max(fit.noise * (0.25 if fit.systematic else 1.0), problem.nominal,
-                problem.step_of_readings / sqrt(12.0))
-    v, other = record.v.copy(), record.other.copy()
-    before = np.isin(record.first + open_, list(already))
-    swapped, settled = before.copy(), len(record.places(already)) - int(before.sum())
-
-    def added(k: int, p: Array) -> Array:
-        """Change of y if the other command acts in interval k."""
-        acting = np.append(other[k], v[k + 1:k + reach])
-        moved = play(acting, fit.gap, float(p[k - 1]) if k else fit.p0) - p[k:k + reach]
-        return lfilter(b, a, fit.m * moved) * known[k:k + reach]
-
-    def along(values: Array) -> Array:
-        """Sums of values (..., N) times what a unit pulse of p in each interval adds to y."""
-        return fit.m * lfilter(b, a, values[..., ::-1])[..., ::-1][..., open_]
-
-    # Most swaps move p in one interval only: their effect is that of a unit pulse, scaled.
-    pulse = lfilter(b, a, fit.m * (np.arange(reach) == 0.0))
-    squares = np.correlate(np.pad(known, (0, reach - 1)), pulse**2)[open_]
-    squares -= (along(q.T) ** 2).sum(axis=0)
-    newest = np.flatnonzero(open_ >= (tail := max(len(v) - NEWEST, 0)))
-    pulses = lfilter(b, a, fit.m * np.eye(len(v) - tail)[open_[newest] - tail]) * known[tail:]
-    products = pulses @ pulses.T - (pulses @ q[tail:]) @ (pulses @ q[tail:]).T
-
-    def log_posterior() -> float:
-        rest = residual - q @ (q.T @ residual)
-        return _log_prior(settled + int(swapped.sum()), count) - 0.5 * float(rest @ rest) / noise**2
-
-    def likeliest(in_pairs: bool) -> list[int]:
-        """The swap, or pair of swaps, that seems to gain most; none if none gains."""
-        p, late = play(v, fit.gap, fit.p0), settled + int(swapped.sum())
-        fewer, same, more = (_log_prior(k, count) for k in (max(late - 1, 0), late, late + 1))
-        rest = residual - q @ (q.T @ residual)
-        at = np.clip(np.append(fit.p0, p[:-1])[open_], other[open_], other[open_] + fit.gap)
-        moved, after = at - p[open_], np.minimum(open_ + 1, len(v) - 1)
-        gains = moved * along(rest) - 0.5 * moved**2 * squares
-        on = np.clip(at, v[after], v[after] + fit.gap) != p[after]  # whether later p change, too
-        for i in np.flatnonzero((moved != 0.0) & on):
-            k = int(open_[i])
-            seen = added(k, p)
-            explained = q[k:k + reach].T @ seen
-            gains[i] = seen @ rest[k:k + reach] - 0.5 * (seen @ seen - explained @ explained)
-        gains = gains / noise**2 + np.where(swapped, fewer, more) - same
-        gains[moved == 0.0] = -inf
-        each, by = np.where(on, -inf, gains)[newest], moved[newest] / noise
-        pairs = np.add.outer(each, each) - np.outer(by, by) * products
-        np.fill_diagonal(pairs, -inf)
-        if in_pairs and pairs.max(initial=-inf) > max(gains.max(), 0.0):
-            return [*map(int, newest[[*divmod(int(pairs.argmax()), len(pairs))]])]
-        return [int(gains.argmax())] if gains.max() > 0.0 else []
-
-    def swap(places: Iterable[int]) -> None:
-        for i in places:
-            k = int(open_[i])
-            residual[k:k + reach] -= added(k, play(v, fit.gap, fit.p0))
-            v[k], other[k], swapped[i] = other[k], v[k], not swapped[i]
-
-    best = log_posterior()
+    intervals = OpenIntervals(setup, record, fit, already, older, since)
+    acting, newest = intervals.start, intervals.newest
+    best = intervals.log_posterior(acting)
     for _ in range(200):  # at most this many times
         # A pair may gain less than it seems; one of three commands may have to be taken back first.
-        back = [([i], True) for i in newest[swapped[newest]].tolist()]
+        back = [([i], True) for i in newest[acting.swapped[newest]].tolist()]
         for taken_back, in_pairs in [([], True), ([], False), *back]:
-            as_it_was = residual.copy(), v.copy(), other.copy(), swapped.copy()
-            swap(taken_back)
-            swap(likeliest(in_pairs))
-            if (now := log_posterior()) > best + 1e-6:
-                best = now
+            there = intervals.swapped(acting, taken_back)
+            there = intervals.swapped(there, intervals.likeliest(there, in_pairs))
+            if (now := intervals.log_posterior(there)) > best + 1e-6:
+                best, acting = now, there
                 break
-            residual, v, other, swapped = as_it_was
         else:
             break
-    found = frozenset((record.first + open_[swapped != before]).tolist())
+    changed = acting.swapped != intervals.start.swapped
+    found = frozenset((record.first + intervals.at[changed]).tolist())
     return record.swapped(found), already ^ found
 
 
