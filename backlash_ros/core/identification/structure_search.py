@@ -19,6 +19,7 @@ import numpy as np
 
 from backlash_ros.core.estimation.fit import FEW_STEPS, FIRST_STEPS
 from backlash_ros.core.estimation.search import search
+from backlash_ros.core.estimation.settings import AS_GOOD
 from backlash_ros.core.identification.model import Model, Samples, Structure, first_model, fitted
 from backlash_ros.core.judgement.deviations import by_model, effective
 from backlash_ros.core.judgement.not_play import Observed, best_other
@@ -92,10 +93,10 @@ def searched(
     """Find the best structure with one of these delays for the whole record."""
     progress('searching the gap')
     units, samples = record.units, replace(record, first=max(delays) + 1, last=len(record.v))
-    found = _with_general(samples, delays)
-    drifting = _with_general(replace(samples, drifts=True), delays)
-    if drifting[0].behind(found[0], effective(drifting[0].left)) < -PLATEAU:
-        samples, found = replace(samples, drifts=True), drifting
+    found, drifting = _with_general(samples, delays), replace(samples, drifts=True)
+    with_drift = _with_general(drifting, delays)
+    if found[0].rms > AS_GOOD * with_drift[0].rms:
+        samples, found = drifting, with_drift
     kept = cleaned(samples, found[0])
     if kept.y is not samples.y or kept.step != samples.step:
         samples = kept
@@ -132,17 +133,19 @@ def searched(
 
 def _with_general(samples: Samples, delays: Sequence[int]) -> list[Model]:
     """Models of different gaps with a general G, the best first."""
-    general = Structure(
-        GENERAL_POLES, min(delays), False, GENERAL_POLES + max(delays) - min(delays))
-    swing = float(np.ptp(samples.v))
-    begins = sorted(first_model(samples, general, gap, float(samples.v[0]) + 0.5 * gap)
-                    for gap in (0.0, 0.05 * swing, 0.2 * swing, 0.5 * swing))
-    best = fitted(samples, general, *(one.fit for one in begins[:2]), steps=FEW_STEPS)
+    # One pole after the other, as several at once often end up close to 1, with a wrong gap.
+    first, *others = (Structure(poles, min(delays), False, poles + max(delays) - min(delays))
+                      for poles in range(GENERAL_POLES + 1))
+    begins = sorted(first_model(samples, first, gap, float(samples.v[0]) + 0.5 * gap)
+                    for gap in (np.ptp(samples.v) * np.array([0.0, 0.05, 0.2, 0.5])).tolist())
+    best = fitted(samples, first, *(one.fit for one in begins[:2]), steps=FEW_STEPS)
+    for general in others:
+        anew = first_model(samples, general, best.gap, best.fit.p0).fit
+        longer = best.begin_with_pole(0.6, general)
+        best = fitted(samples, general, anew, longer, steps=FEW_STEPS)
     models = _of_gaps(samples, best)
-    # Linearised around the better G, the search may find another gap.
-    if models[0].squares < 0.9 * best.squares and abs(models[0].gap - best.gap) > 0.1 * best.gap:
-        models = _of_gaps(samples, models[0])
-    return models
+    # Linearised around a better G, the search may find another gap.
+    return _of_gaps(samples, models[0]) if models[0].squares < 0.9 * best.squares else models
 
 
 def _of_gaps(samples: Samples, like: Model) -> list[Model]:

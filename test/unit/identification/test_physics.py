@@ -33,6 +33,13 @@ def test_identified_from_limits_alone_the_loop_removes_what_backlash_does(identi
     assert run.said_tracking_off_by(lost) < 0.05
 
 
+def test_what_was_identified_serves_a_motion_with_other_turns(identified):
+    assert identified.parameters is not None
+    run = gear_runs.close_loop(SERVO, identified.controller, 'triangle', periods=3)
+    none = gear_runs.uncompensated(SERVO, identified.parameters, 'triangle').error
+    assert run.error < 0.25 * none
+
+
 def test_a_fit_that_takes_g_far_from_its_prior_does_not_replace_what_was_identified():
     runs = run_gears('cnc')
     assert all(run.usable for run in runs)
