@@ -6,7 +6,7 @@
 A structure with a pole that a zero cancels gives way to the same one without that pole. Structures
 whose held-out error is within 5 % or one standard deviation of the least predict equally well; the
 one with the least BIC over all samples, N' log(squares) + unknowns log(N'), is chosen from them,
-with N' = N (1 - r) / (1 + r) for the lag-1 correlation r of the residual.
+with N' = N (1 - r) / (1 + r) for the lag-1 correlation r of N independent residuals.
 """
 
 from collections.abc import Callable, Sequence
@@ -141,8 +141,7 @@ def _with_general(samples: Samples, delays: Sequence[int]) -> list[Model]:
     best = fitted(samples, first, *(one.fit for one in begins[:2]), steps=FEW_STEPS)
     for general in others:
         anew = first_model(samples, general, best.gap, best.fit.p0).fit
-        longer = best.begin_with_pole(0.6, general)
-        best = fitted(samples, general, anew, longer, steps=FEW_STEPS)
+        best = fitted(samples, general, anew, best.begin_with_pole(0.6, general), steps=FEW_STEPS)
     models = _of_gaps(samples, best)
     # Linearised around a better G, the search may find another gap.
     return _of_gaps(samples, models[0]) if models[0].squares < 0.9 * best.squares else models
@@ -203,7 +202,8 @@ def _compare(
         found[structure] = trained, fitted(
             samples, structure, trained.fit, steps=FIRST_STEPS, least_gain=ALIKE)
     best = min(whole for _, whole in found.values())
-    count, rows = len(best.left), effective(best.left)
+    weights = best.run.weights[best.problem.known]  # readings that repeat an error count once
+    rows, exact = float(weights.mean()) * effective(best.left), EXACT**2 * len(weights)
     compared = []
     for structure, (trained, whole) in found.items():
         if whole.squares <= HOPELESS * best.squares:
@@ -213,7 +213,7 @@ def _compare(
         rms = float(np.sqrt(np.mean(error**2)))
         compared.append(Compared(
             structure, max(rms, EXACT) if np.isfinite(rms) else inf, trained, whole,
-            rows * log(max(whole.squares, EXACT**2 * count))
+            rows * log(max(float(weights @ whole.left**2), exact))
             + structure.unknowns * log(max(rows, 1.0)), 1.0 / sqrt(2.0 * effective(error))))
     return compared
 

@@ -14,7 +14,7 @@ from scipy.signal import lfilter
 from backlash_ros.core.control.motion import strokes
 from backlash_ros.core.identification.identification import Identification, identify
 from backlash_ros.core.identification.model import Samples, Structure, Units, first_model, fitted
-from backlash_ros.core.identification.structure_search import Options
+from backlash_ros.core.identification.structure_search import Options, searched
 from backlash_ros.core.plant.backlash import play
 
 Array = NDArray[np.float64]
@@ -123,6 +123,21 @@ def test_a_drift_of_y_is_no_part_of_the_gap_and_is_told(rise: float) -> None:
     assert found.c_r == pytest.approx(0.5 - rise, abs=3e-3)
     assert found.model.denominator == pytest.approx((1.0, -1.7, 0.755), abs=0.01)
     assert any(remark.startswith(f'c_r and c_l drift by {-rise:.2g} ') for remark in found.remarks)
+
+
+def test_a_long_rest_does_not_speak_for_another_order() -> None:
+    """Its readings share one rounding error, which a higher order may fit by chance."""
+    options, v = Options(orders=(2, 3), integrators=(False,)), motion(1600)
+
+    def gain(rest: int) -> float:
+        """Gain of the criterion by a third pole if v rests for so long in the end."""
+        held = np.append(v, np.full(rest, v[-1]))
+        read = 0.02 * np.round(answer(held, 0.9, 0.5, 1e-3, 1) / 0.02)
+        samples = Samples(held, read, 0, 0, 0.0, Units())
+        two, three = searched(samples, options, (0,), lambda _: None).compared
+        return two.criterion - three.criterion
+
+    assert gain(3000) < gain(100) + 10.0
 
 
 def test_a_first_model_leads_to_the_true_one() -> None:
