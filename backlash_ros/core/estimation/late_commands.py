@@ -71,7 +71,7 @@ class OpenIntervals:
 
     def log_posterior(self, acting: Acting) -> float:
         rest = self._unexplained(acting)
-        return self._log_prior(acting) - 0.5 * float(rest @ rest) / self._noise**2
+        return self._prior_of(acting) - 0.5 * float(rest @ rest) / self._noise**2
 
     def swapped(self, acting: Acting, places: Sequence[int]) -> Acting:
         """The same with the other command in these of the open intervals."""
@@ -97,7 +97,7 @@ class OpenIntervals:
             seen = self._added(k, v, other, p)
             explained = q[k:k + reach].T @ seen
             gains[i] = seen @ rest[k:k + reach] - 0.5 * (seen @ seen - explained @ explained)
-        fewer, same, more = (self._log_prior(acting, change) for change in (-1, 0, 1))
+        fewer, same, more = (self._prior_of(acting, count) for count in (-1, 0, 1))
         gains = gains / self._noise**2 + np.where(swapped, fewer, more) - same
         gains[moved == 0.0] = -inf
         each, by = np.where(on, -inf, gains)[self.newest], moved[self.newest] / self._noise
@@ -129,8 +129,9 @@ class OpenIntervals:
     def _unexplained(self, acting: Acting) -> Array:
         return acting.residual - self._q @ (self._q.T @ acting.residual)
 
-    def _log_prior(self, acting: Acting, change: int = 0) -> float:
-        late = self._settled + int(acting.swapped.sum()) + change
+    def _prior_of(self, acting: Acting, more: int = 0) -> float:
+        """Its log-prior with so many more commands swapped."""
+        late = self._settled + int(acting.swapped.sum()) + more
         return _log_prior(max(late, 0), self._count)
 
 
@@ -142,7 +143,7 @@ def likelier(
 
     already: samples swapped so far. Returns the record and all samples that are swapped in it.
     """
-    if not np.isfinite(record.between(since).other).any() or fit.m <= 0.0:
+    if not record.between(since).is_open or fit.m <= 0.0:
         return record, already
     intervals = OpenIntervals(setup, record, fit, already, older, since)
     acting, newest = intervals.start, intervals.newest

@@ -6,7 +6,7 @@
 A structure with a pole that a zero cancels gives way to the same one without that pole. Structures
 whose held-out error is within 5 % or one standard deviation of the least predict equally well; the
 one with the least BIC over all samples, N' log(squares) + unknowns log(N'), is chosen from them,
-with N' = N (1 - r) / (1 + r) for the lag-1 correlation r of N independent residuals.
+with N' = N (1 - r) / (1 + r) for the lag-1 correlation r. Residuals that repeat count once.
 """
 
 from collections.abc import Callable, Sequence
@@ -94,7 +94,7 @@ def searched(
     progress('searching the gap')
     units, samples = record.units, replace(record, first=max(delays) + 1, last=len(record.v))
     found, drifting = _with_general(samples, delays), replace(samples, drifts=True)
-    with_drift = _with_general(drifting, delays)
+    with_drift = found if samples.drifts else _with_general(drifting, delays)
     if found[0].rms > AS_GOOD * with_drift[0].rms:
         samples, found = drifting, with_drift
     kept = cleaned(samples, found[0])

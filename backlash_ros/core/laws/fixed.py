@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from math import inf, nan
+from math import nan
 
 import numpy as np
 
@@ -39,11 +39,11 @@ class FixedBacklash(Law):
         self._noise_std, self._noise = max(noise_std, 1e-12), NoiseLevel()
         self._x, self._u, self._started = [0.0] * (n + 1), 0.0, False
         # Covariances of x (n + 1, n + 1): after the newest sample and, without the change of d,
-        # before the next one; of that and y (n + 1,). They do not depend on y(k).
+        # before the next one. They do not depend on y(k).
         self._p: Array = np.zeros((n + 1, n + 1))
-        self._p_ahead, self._cross = self._p.copy(), [0.0] * (n + 1)
-        # Change of d, and the variance of y(k), inf if it was lost; None: they are in _p.
-        self._newest: tuple[float, float] | None = None
+        self._p_ahead = self._p.copy()
+        # Change of d and the gain, [] if y was lost, of the newest sample; None: they are in _p.
+        self._newest: tuple[float, list[float]] | None = None
 
     def with_model(self, model: StateModel) -> FixedBacklash:
         self.prepare()
@@ -77,31 +77,31 @@ class FixedBacklash(Law):
         x = [dot(row, self._x) for row in self._rows]
         for i, b in enumerate(self._b):
             x[i] += b * u
-        self._x, self.innovation, noise_var, variance = x, nan, self._noise_var, inf
+        self._x, self.innovation, noise_var, gain = x, nan, self._noise_var, list[float]()
         if y is not None:
             if not self._started:
                 # A prior that is wide compared with the first output and the noise.
                 wide = 1e3 * (abs(y) + noise_var**0.5)
                 self._p_ahead[:-1, :-1] += wide**2 * np.eye(len(self._b))
-                self._cross = (self._c * self._p_ahead[:, 0]).tolist()
                 self._started = True
-            variance = self._c * self._cross[0] + noise_var
+            cross = [self._c * each for each in self._p_ahead[:, 0].tolist()]
+            variance = self._c * cross[0] + noise_var
+            gain = [each / variance for each in cross]
             self.innovation = innovation = y - self._c * x[0]
-            for i, cross in enumerate(self._cross):
-                x[i] += cross / variance * innovation
-        self._newest = self._doubt * (u - before), variance
+            for i, each in enumerate(gain):
+                x[i] += each * innovation
+        self._newest = self._doubt * (u - before), gain
 
     def prepare(self) -> None:
         if self._newest is None:
             return
-        (change, variance), self._newest, p = self._newest, None, self._p_ahead
+        (change, gain), self._newest, p = self._newest, None, self._p_ahead
         p[-1, -1] += change**2
-        if variance < inf:
+        if gain:
             # In Joseph's form, which stays positive however wide the prior is beside the noise.
-            gain, kept = np.array(self._cross) / variance, np.eye(len(p))
-            kept[:, 0] -= self._c * gain
+            kept = np.eye(len(p))
+            kept[:, 0] -= self._c * np.array(gain)
             p = kept @ p @ kept.T + self._noise_var * np.outer(gain, gain)
             self._noise.take(self.innovation)
         self._p = 0.5 * (p + p.T)
         self._p_ahead = self._transition @ self._p @ self._transition.T
-        self._cross = (self._c * self._p_ahead[:, 0]).tolist()

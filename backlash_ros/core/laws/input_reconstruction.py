@@ -106,9 +106,10 @@ class InputReconstruction:
         return self.samples > 2 * self.lag and self._covariance.item(-1) <= 4.0 * self.std**2
 
     @property
-    def x_hat(self) -> Array:
-        """State of G given y(..k) in the coordinates of StateModel, shape (n,)."""
-        return np.asarray(self._z[:-2 - self.lag] * self._scale)
+    def x_hat(self) -> list[float]:
+        """State of G given y(..k) in the coordinates of StateModel, (n,)."""
+        x: list[float] = (self._z[:-2 - self.lag] * self._scale).tolist()
+        return x
 
     def update(self, y: float | None) -> float:
         """Process y(k), None if it was lost, and return u_hat(k - lag)."""

@@ -50,8 +50,7 @@ class LaggedLaw(Law):
 
     @property
     def x_hat(self) -> list[float]:
-        x: list[float] = self._reconstruction.x_hat.tolist()
-        return x
+        return self._reconstruction.x_hat
 
     def update(self, y: float | None, interval: Interval) -> None:
         """Process y(k) and learn from the sample that the reconstruction has reached."""

@@ -117,8 +117,7 @@ class Learner(Law):
 
     @property
     def x_hat(self) -> list[float]:
-        x_hat: list[float] = self._observers[self.model].x_hat
-        return x_hat
+        return self._observers[self.model].x_hat
 
     @property
     def x_cov(self) -> Array:
