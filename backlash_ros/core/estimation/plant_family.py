@@ -1,19 +1,22 @@
 """The family of linear plants that G(z) may be; all have the nominal gain at rest.
 
-    G(z; xi) = z^-i [B (1 - f + f z^-1) + xi_w w (1 - z^-1)^2 B'] A(1)/A_nominal(1) / (A I)
+    G(z; xi) = z^-i [B_x (1 - f + f z^-1) + xi_w w (1 - z^-1)^2 B'] A(1)/A_nominal(1) / (A I)
 
 xi (K,), in units of prior standard deviations: the leak of an integrator, if G integrates; a lag of
 i + f samples beyond the nominal delay, i whole; the width of the response, with w = 1/8 and B' = B
 one sample shorter; ln Omega, ln D of each pair of poles, s^2 + 2 D Omega s + Omega^2; ln of a real
-pole left over. Poles at 0, on the negative axis or outside the unit circle are kept.
+pole left over. B_x is B of a G(s) faster by the mean change x of ln Omega, or B if there are poles
+that are kept: on the negative axis or on the unit circle. Poles at 0 are a delay.
 """
 
 from collections.abc import Sequence
+from itertools import zip_longest
 from math import copysign, floor, inf
 
 import numpy as np
 
 from backlash_ros.core.plant.numerics import denominator_of, multiplied, padded, sections_of
+from backlash_ros.core.plant.time_scale import ScaledNumerator
 from backlash_ros.core.plant.transfer_function import ON_CIRCLE, Array, TransferFunction, memory_of
 
 # G jumps where i changes: so far below a whole number of samples, which is the most usual lag. This
@@ -30,22 +33,20 @@ class PlantFamily:
 
     def __init__(self, model: TransferFunction, uncertainty: float) -> None:
         b, poles = np.trim_zeros(model.numerator, 'f'), model.poles
+        poles = poles[abs(poles) > ON_CIRCLE]
         integrators = abs(poles - 1.0) < ON_CIRCLE
-        elsewhere = ~integrators & (abs(poles) > ON_CIRCLE)
-        moving = elsewhere & (abs(poles) < 1.0 - ON_CIRCLE)
-        moving &= (poles.imag != 0.0) | (poles.real >= 0.0)
+        moving = ~integrators & (abs(poles) < 1.0 - ON_CIRCLE) & (abs(np.angle(poles)) < np.pi)
         self.model, self.integrates = model, bool(integrators.any())
         self.memory = memory_of(max(abs(poles[moving]), default=0.0))
         # Denominator of the poles that are kept, except the first integrator, which may leak.
-        rest = np.concatenate([poles[elsewhere & ~moving], poles[integrators][1:].round()])
+        rest = np.concatenate([poles[~integrators & ~moving], poles[integrators][1:].round()])
         self._rest: list[float] = np.atleast_1d(np.real(np.poly(rest))).tolist()
         self._pairs, self._nominal = sections_of(poles[moving])
         a = [x.real for x in denominator_of(self._pairs, *self._nominal)]
         self._gain, self._delay = sum(a), len(model.denominator) - len(b)
-        # Delay of B and of A at low frequency [samples]. However short, by default a lag of one
-        # sample is usual: a driver may apply v, or read y, a sample later than expected.
-        of_b, of_a = (float(np.arange(len(x)) @ x) / (sum(x) or inf) for x in (b, a))
-        late = max(self._delay + of_b - of_a, 5.0)
+        # However short G is, a lag of one sample is usual: drivers apply v, or read y, that late.
+        stable = TransferFunction(b.tolist(), padded(np.array(a), len(model.denominator)).tolist())
+        late = max(stable.group_delay, 5.0)
         # Prior std and limit of what each xi changes. Limits: a leak of 0.1 a sample,
         # a lag of 40 samples, a factor of 20 on Omega and D. 0.125: acting half a sample late.
         self._scales = [
@@ -55,9 +56,9 @@ class PlantFamily:
         self.count, self.leaks = len(self._scales), int(self.integrates and uncertainty > 0.0)
         shorter = np.poly1d([1.0, 1.0]) ** max(len(b) - 2, 0)
         wide = np.convolve(shorter * (b.sum() / shorter(1.0)), [1.0, -2.0, 1.0])
-        # B, and its derivatives by lag and width.
-        taps = b, np.append(0.0, b) - np.append(b, 0.0), wide
-        self._taps: list[list[float]] = [padded(t, max(len(b) + 1, 3)).tolist() for t in taps]
+        self._numerator = ScaledNumerator(b, poles if (moving | integrators).all() else poles[:0])
+        self._wide: list[float] = np.append(np.zeros(self._numerator.early), wide).tolist()
+        self._delay -= self._numerator.early
 
     def at(self, xi: list[float]) -> tuple[list[float], list[float]]:
         b, a = self._coefficients(xi)
@@ -78,13 +79,15 @@ class PlantFamily:
                  for x, (scale, limit) in zip(xi, self._scales, strict=True)]
         moved = moved or [0.0] * (2 + len(self._nominal))
         integrator = [1.0, -1.0 + (moved.pop(0) if self.leaks else 0.0)] * self.integrates
-        lag, width, *logs = moved
-        logs = [x + y for x, y in zip(self._nominal, logs, strict=True)]
+        lag, width, *changes = moved
+        logs = [x + y for x, y in zip(self._nominal, changes, strict=True)]
+        pairs, real = changes[:2 * self._pairs:2], changes[2 * self._pairs:]
+        taps = self._numerator.at((2.0 * sum(pairs) + sum(real)) / max(len(changes), 1))
         stable = denominator_of(self._pairs, *logs)
         whole, gain = max(floor(lag.real + BEFORE_WHOLE), 1 - self._delay), sum(stable) / self._gain
         b = [0j] * (self._delay + whole - 1) + [
-            gain * (x + (lag - whole) * move + width * wide)
-            for x, move, wide in zip(*self._taps, strict=True)]
+            gain * (x + (lag - whole) * (before - x) + width * wide)
+            for x, before, wide in zip_longest(taps, [0.0, *taps], self._wide, fillvalue=0.0)]
         a = multiplied(stable, self._rest, integrator or [1.0])
         while not self.count and not b[-1]:  # trim, unless the length must be the same at all xi
             b.pop()

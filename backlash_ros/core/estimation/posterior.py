@@ -167,9 +167,8 @@ def error_of_plant(
         shrink = 1.0 / (1.0 + told / noise)
         left = squares + (shrink * power).sum(axis=1, keepdims=True)
         noise = noise if f.step else left / freedom
-    fits = left if f.step else freedom * np.log(left)
     volumes = 0.5 * (np.log(shrink).sum(axis=1) - np.log(scales[:, 0]) ** 2)
-    each = volumes - 0.5 * fits[:, 0]
+    each = volumes - 0.5 * (left if f.step else freedom * np.log(left))[:, 0]
     share = np.exp(each - each.max())
     share /= share.sum()
     means = scales**2 / noise * singular * shrink * z

@@ -27,9 +27,8 @@ def coasts(problem: Problem, fit: WindowFit, known: Array | None = None) -> bool
     matters = 2e-3  # least unexplained motion over the gap; quantization of slow motion leaves less
     if not (fit.m > 0.0 and fit.left.turns and fit.systematic and fit.unexplained > matters):
         return False
-    if known is not None and _coasting_score(problem, as_known(problem, known, fit)) > named:
-        return True
-    return _coasting_score(problem, fit) > named
+    tested = [fit] if known is None else [fit, as_known(problem, known, fit)]
+    return any(_coasting_score(problem, f) > named for f in tested)
 
 
 def as_known(problem: Problem, known: Array, fit: WindowFit) -> WindowFit:

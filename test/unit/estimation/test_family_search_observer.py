@@ -73,6 +73,35 @@ def test_dead_time_and_another_frequency_are_among_them(
     assert min(abs(least_squares(apart, begin).fun).max() for begin in begins) < most
 
 
+SCALED = {
+    **PLANTS, 'zero near the poles': ([0.3, -0.27], [1.0, -1.8, 0.85]),
+    'integrator and zeros': ([0.2, 0.1, -0.05], [1.0, -2.5, 2.06, -0.56]),
+    'equal poles': ([0.02, 0.01], [1.0, -1.6, 0.64]),
+    'late': ([0.01], [1.0, -2.4, 1.94, -0.532, 0.0, 0.0]),
+}
+
+
+@pytest.mark.parametrize('faster', [0.6, 0.87, 1.15, 1.7])
+@pytest.mark.parametrize('plant', SCALED.values(), ids=SCALED)
+def test_zeros_move_with_the_poles_of_a_faster_plant(
+    plant: tuple[list[float], list[float]], faster: float,
+) -> None:
+    model = TransferFunction(*plant)
+    family, z = PlantFamily(model, 1.0), np.exp(1j * np.linspace(0.05, 3.0, 60))
+    poles = [pole for pole in model.poles if 1e-6 < abs(pole) < 1.0 - 1e-6]
+    pairs = len(poles) // 2
+    moved = [np.log(faster), 0.0] * pairs + [np.log(faster)] * (len(poles) % 2)
+    xi = [*[0.0] * (family.leaks + 2), *moved]
+    np.testing.assert_allclose(
+        family.model_at(xi).response(z), altered_plant(model, faster).response(z), rtol=2e-5)
+
+
+def test_zeros_stay_where_no_continuous_plant_has_such_poles() -> None:
+    family = PlantFamily(TransferFunction([0.2, 0.1], [1.0, -0.4, -0.21]), 1.0)  # 0.7, -0.3
+    b, _ = family.at([0.0, 0.0, 0.3])
+    assert b[1] / b[0] == pytest.approx(0.5)
+
+
 @pytest.mark.parametrize('plant', PLANTS.values(), ids=PLANTS)
 def test_the_response_is_continuous_around_lags_of_whole_samples(
     plant: tuple[list[float], list[float]],

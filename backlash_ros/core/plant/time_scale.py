@@ -1,0 +1,56 @@
+"""The numerator of a sampled plant G(z) whose continuous G(s) becomes faster or slower."""
+
+from math import copysign, log
+
+import numpy as np
+
+from backlash_ros.core.plant.numerics import padded
+from backlash_ros.core.plant.transfer_function import ON_CIRCLE, Array, Roots, TransferFunction
+
+FASTER = log(2.0)  # largest |x|; a larger one has the same effect
+DEGREE = 8  # of the polynomials of x, which err by some 1e-7 of b
+
+
+class ScaledNumerator:
+    """Numerator B(x) of G(s e^-x) = B/A sampled with u held; its sum does not change.
+
+    b: at x = 0, from the first effect on y on, (M,). poles: of G(z), none at 0 or on the negative
+    axis, (P,). early: samples by which B(x) begins before b. size: number of its coefficients.
+    B is always b if that has more than P coefficients, or poles lie too close to each other.
+    """
+
+    def __init__(self, b: Array, poles: Roots) -> None:
+        self.early = max(len(poles) - len(b), 0)
+        begun = np.append(np.zeros(self.early), b)
+        powers = begun[None] if len(begun) > len(poles) else _polynomials(begun, poles)
+        if np.abs(powers[-1] - begun).max() > 1e-4 * np.abs(b).max():
+            self.early, powers, begun = 0, b[None], b
+        powers[-1] = begun
+        self.size = len(begun)
+        self._powers: list[list[float]] = powers.tolist()  # of x, the highest first
+
+    def at(self, x: complex) -> list[complex]:
+        """B(x), from z^(early - delay) on; x may have a small imaginary part, as derivatives do."""
+        x = x if abs(x.real) < FASTER else copysign(FASTER, x.real)
+        b: list[complex] = [0j] * self.size
+        for power in self._powers:
+            b = [value * x + each for value, each in zip(b, power, strict=True)]
+        return b
+
+
+def _polynomials(b: Array, poles: Roots) -> Array:
+    """B(x) of b (P,) by powers of x, the highest first: (DEGREE + 1, P)."""
+    n, modes = len(poles), np.log(np.append(poles, 1.0).astype(complex))
+    model, x = TransferFunction(b.tolist(), np.real(np.poly(poles)).tolist()), [0.0] * len(poles)
+    response = np.array([0.0, *(model.advance(x, 1.0) for _ in range(n))])
+    # The step response is a sum of exponentials of t, and of powers of t for poles at 1.
+    ones, t = np.abs(modes) < ON_CIRCLE, np.arange(n + 1)[:, None]
+    power = np.where(ones, np.cumsum(ones) - 1, 0)
+    weights = np.linalg.lstsq(np.exp(t * modes) * t**power, response, rcond=None)[0]
+    nodes = FASTER * np.cos(np.pi * (np.arange(DEGREE + 1) + 0.5) / (DEGREE + 1))  # Chebyshev
+    values = np.zeros((DEGREE + 1, n))
+    for row, s in zip(values, np.exp(nodes), strict=True):
+        response = np.real(np.exp(s * t * modes) * (s * t) ** power @ weights)
+        row[:] = padded(np.convolve(np.real(np.poly(np.exp(s * modes))), response)[1:], n)
+        row *= b.sum() / row.sum()
+    return np.asarray(np.polyfit(nodes, values, DEGREE))
