@@ -190,8 +190,8 @@ class MovingHorizon(Law):
             self.estimate = replace(self.estimate, status=status)
 
     def prepare(self) -> None:
-        if self._following.before is not None:
-            self._following.before.prepare()
+        if source := self._following.observer or self._following.before:
+            source.prepare()
 
     def refine(self) -> None:
         channel, following, setup = self._channel, self._following, self._setup

@@ -9,7 +9,7 @@ commands soon after each other look like one between them, pairs are compared, t
 
 from collections.abc import Sequence
 from dataclasses import replace
-from math import exp, inf, sqrt
+from math import exp, inf, lgamma, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -185,6 +185,5 @@ def weighed(
 
 def _log_prior(late: int, count: int) -> float:
     """Logarithm of the prior probability that just these of `count` commands were late."""
-    from scipy.special import betaln  # late: 31 MB that only fits need
-
-    return float(betaln(late + 0.5, max(count - late, 0) + 0.5))
+    a, b = late + 0.5, max(count - late, 0) + 0.5
+    return lgamma(a) + lgamma(b) - lgamma(a + b)

@@ -1,17 +1,16 @@
 """Between fits: u from the play operator, the state of G from an observer with constant gain.
 
-    x_i(k+1) = x_{i+1}(k) - a_i x_1(k) + b_i u(k) + k_i (y(k) - x_1(k))
+    x(k+1) = A (x(k) + l (y(k) - c x_0(k))) + b u(k)
 
-In this observer form, whose first state is y, a step costs a few products. The gain is that of a
-stationary Kalman filter; the white noise on u is assumed to be just large enough to explain the
-size of the innovations (R. K. Mehra, IEEE Trans. Automatic Control 15 (1970) 175-184).
+in the coordinates of StateModel, with the gain l of a stationary Kalman filter: the white noise on
+u is assumed to be just large enough to explain the innovations (R. K. Mehra, IEEE Trans. Automatic
+Control 15 (1970) 175-184).
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from functools import partial
 from math import isnan, nan
 from typing import NamedTuple
 
@@ -29,7 +28,7 @@ from backlash_ros.core.plant.transfer_function import Array, StateModel, Transfe
 class Observer:
     """Kalman observer of the state of G. before: the observer it replaces, of another G.
 
-    gains: `gains_of` this G, or (). variance: of the innovation. cov: of StateModel's state (n, n).
+    gains: `gains_of` this G, or (). state: (n,). variance: of the innovation. cov: of the state.
     """
 
     def __init__(
@@ -41,30 +40,33 @@ class Observer:
         self._model, self._gains = model, gains
         self._set_level(min(len(RATIOS) // 2, highest), noise_std)
         self.variance = (self._gain.innovation * noise_std) ** 2
-        self._x = [0.0] * model.order
-        self._to_state = tuple(map(tuple, model.to_state.tolist()))
-        # Advances the state by one period with this u; returns the predicted y.
-        self.predict = partial(model.transfer_function.advance, self._x)
+        self._rows, self._b = model.a.tolist(), model.b.tolist()
+        self.state, self._ahead = [0.0] * model.order, list[float]()  # A state, [] until computed
 
     def _set_level(self, level: int, noise_std: float) -> None:
         self.level, self.noise_std = level, noise_std
         self._gain = self._gains[level] if self._gains else gain_of(self._model, RATIOS[level])
         self.cov = self._gain.cov * noise_std**2
 
-    @property
-    def state(self) -> list[float]:
-        """x in the coordinates of StateModel, (n,)."""
-        return [dot(row, self._x) for row in self._to_state]
-
     def place(self, x: Array, known: bool) -> None:
         """Set the state (in observer form); if it is `known`, continue with the smallest gain."""
-        self._x[:] = x.tolist()
+        self.state, self._ahead = (self._model.to_state @ x).tolist(), []
         if known:
             self._set_level(0, self.noise_std)
 
+    def prepare(self) -> None:
+        """Compute what the next prediction need not wait for."""
+        self._ahead = self._ahead or [dot(row, self.state) for row in self._rows]
+
+    def predict(self, u: float) -> float:
+        """Advance the state by one period with this u; return the predicted y."""
+        self.prepare()
+        self.state, self._ahead = [x + b * u for x, b in zip(self._ahead, self._b, strict=True)], []
+        return self._model.c * self.state[0]
+
     def correct(self, innovation: float) -> None:
         """Correct the state by an innovation, y minus its prediction."""
-        x = self._x
+        x = self.state
         for i, k in enumerate(self._gain.gain):
             x[i] += k * innovation
         self.variance += (innovation * innovation - self.variance) / 100.0

@@ -43,7 +43,8 @@ class PlantFamily:
         self._rest: list[float] = np.atleast_1d(np.real(np.poly(rest))).tolist()
         self._pairs, self._nominal = sections_of(poles[moving])
         a = [x.real for x in denominator_of(self._pairs, *self._nominal)]
-        self._gain, self._delay = sum(a), len(model.denominator) - len(b)
+        self._numerator = ScaledNumerator(b, poles if (moving | integrators).all() else poles[:0])
+        self._gain, self._delay = sum(a), len(model.denominator) - len(b) - self._numerator.early
         # However short G is, a lag of one sample is usual: drivers apply v, or read y, that late.
         stable = TransferFunction(b.tolist(), padded(np.array(a), len(model.denominator)).tolist())
         late = max(stable.group_delay, 5.0)
@@ -56,9 +57,7 @@ class PlantFamily:
         self.count, self.leaks = len(self._scales), int(self.integrates and uncertainty > 0.0)
         shorter = np.poly1d([1.0, 1.0]) ** max(len(b) - 2, 0)
         wide = np.convolve(shorter * (b.sum() / shorter(1.0)), [1.0, -2.0, 1.0])
-        self._numerator = ScaledNumerator(b, poles if (moving | integrators).all() else poles[:0])
         self._wide: list[float] = np.append(np.zeros(self._numerator.early), wide).tolist()
-        self._delay -= self._numerator.early
 
     def at(self, xi: list[float]) -> tuple[list[float], list[float]]:
         b, a = self._coefficients(xi)

@@ -30,7 +30,7 @@ class FixedBacklash(Law):
         self.estimate = replace(
             initial, std_m=0.0, std_c_r=0.0, std_c_l=0.0, status=Status.TRACKING)
         self._doubt, n = doubt, model.order
-        self._b: list[float] = model.b.tolist()
+        self._b: list[float] = [*model.b.tolist(), 0.0]
         self._c = model.c
         self._transition = np.eye(n + 1)
         self._transition[:n, :n], self._transition[:n, n] = model.a, model.b
@@ -42,8 +42,9 @@ class FixedBacklash(Law):
         # before the next one. They do not depend on y(k).
         self._p: Array = np.zeros((n + 1, n + 1))
         self._p_ahead = self._p.copy()
-        # Change of d and the gain, [] if y was lost, of the newest sample; None: they are in _p.
-        self._newest: tuple[float, list[float]] | None = None
+        # Change of d, and whether y came, of the newest sample; None: they are in _p.
+        self._newest: tuple[float, bool] | None = None
+        self._look_ahead()
 
     def with_model(self, model: StateModel) -> FixedBacklash:
         self.prepare()
@@ -74,34 +75,37 @@ class FixedBacklash(Law):
         self.prepare()
         e, v, before = self.estimate, interval.v, self._u
         self._u = u = clamp(before, e.m * (v - e.c_r), e.m * (v - e.c_l))
-        x = [dot(row, self._x) for row in self._rows]
-        for i, b in enumerate(self._b):
-            x[i] += b * u
-        self._x, self.innovation, noise_var, gain = x, nan, self._noise_var, list[float]()
+        self._x = x = [ahead + b * u for ahead, b in zip(self._x_ahead, self._b, strict=True)]
+        self.innovation = nan
         if y is not None:
             if not self._started:
                 # A prior that is wide compared with the first output and the noise.
-                wide = 1e3 * (abs(y) + noise_var**0.5)
-                self._p_ahead[:-1, :-1] += wide**2 * np.eye(len(self._b))
+                wide = 1e3 * (abs(y) + self._noise_var**0.5)
+                self._p_ahead[:-1, :-1] += wide**2 * np.eye(len(x) - 1)
                 self._started = True
-            cross = [self._c * each for each in self._p_ahead[:, 0].tolist()]
-            variance = self._c * cross[0] + noise_var
-            gain = [each / variance for each in cross]
+                self._look_ahead()
             self.innovation = innovation = y - self._c * x[0]
-            for i, each in enumerate(gain):
-                x[i] += each * innovation
-        self._newest = self._doubt * (u - before), gain
+            for i, gain in enumerate(self._gain):
+                x[i] += gain * innovation
+        self._newest = self._doubt * (u - before), y is not None
 
     def prepare(self) -> None:
         if self._newest is None:
             return
-        (change, gain), self._newest, p = self._newest, None, self._p_ahead
+        (change, heard), self._newest, p = self._newest, None, self._p_ahead
         p[-1, -1] += change**2
-        if gain:
+        if heard:
             # In Joseph's form, which stays positive however wide the prior is beside the noise.
-            kept = np.eye(len(p))
-            kept[:, 0] -= self._c * np.array(gain)
+            kept, gain = np.eye(len(p)), np.array(self._gain)
+            kept[:, 0] -= self._c * gain
             p = kept @ p @ kept.T + self._noise_var * np.outer(gain, gain)
             self._noise.take(self.innovation)
         self._p = 0.5 * (p + p.T)
         self._p_ahead = self._transition @ self._p @ self._transition.T
+        self._look_ahead()
+
+    def _look_ahead(self) -> None:
+        """Compute the gain for the next sample, and x then, but for u and y: lists, as above."""
+        cross = self._c * self._p_ahead[:, 0]
+        self._gain: list[float] = (cross / (self._c * cross[0] + self._noise_var)).tolist()
+        self._x_ahead = [dot(row, self._x) for row in self._rows]

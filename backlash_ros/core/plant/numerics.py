@@ -201,11 +201,11 @@ def lyapunov(a: Array, q: Array) -> Array:
 
 
 class Gain(NamedTuple):
-    """Gain and standard deviations of the stationary Kalman filter, in units of the noise on y."""
+    """The stationary Kalman filter of a StateModel, with the noise on y as the unit of y."""
 
-    gain: tuple[float, ...]  # of the update after a prediction, in observer form
+    gain: tuple[float, ...]  # of the update after a prediction
     innovation: float  # standard deviation of the innovation
-    cov: Array  # of the state in the coordinates of StateModel, (n, n)
+    cov: Array  # of the state, (n, n)
     quiet: float  # `innovation` with this gain, but with a tenth of the noise on u
 
 
@@ -227,9 +227,8 @@ def gain_of(model: StateModel, ratio: float) -> Gain:
         quiet = lyapunov(model.a - np.outer(after, c), np.outer(after, after) + noise * 10.0**-2)
     except np.linalg.LinAlgError:
         return Gain((0.0,) * n, 1.0, np.eye(n), 1.0)
-    return Gain(
-        tuple((model.to_observer @ column).tolist()), sqrt(variance),
-        p - np.outer(column, column) * variance, sqrt(float(c @ quiet @ c) + 1.0))
+    return Gain(tuple(column.tolist()), sqrt(variance), p - np.outer(column, column) * variance,
+                sqrt(float(c @ quiet @ c) + 1.0))
 
 
 # Effects of the noise on u that gains are designed for, relative to the noise on y (`gain_of`).

@@ -273,7 +273,7 @@ def test_where_the_play_began_does_not_contradict_readings_that_were_rounded() -
 
 def test_a_driver_that_skips_commands_is_doubted_for_a_moment_and_blamed_for_nothing() -> None:
     p = Parameters({**motor(), 'estimator.use_applied_control': 'false'})
-    heard = HeldUpProcesses(p, 1.0, seed=3, reports=False).run(1.5)
+    heard = HeldUpProcesses(p, 1.0, seed=2, reports=False).run(1.5)
     states = [one.estimate.status for one in heard]
     assert Status.ACQUIRING in states[states.index(Status.TRACKING):]
     assert Status.INCONSISTENT not in states
