@@ -115,6 +115,7 @@ def afresh(
         if not found or found[0].evidence < null + settings.ENGAGED:
             return None
         gaps = [f.gap for f in known if f.behind(xi) < 1.0]  # another G, another optimum
+        begun = dict[WindowFit, float]()  # with the evidence that the search has found
         for evidence, gap, p0, m, peak in found:
             # Around the wrong G, the evidence of another optimum may be far too low.
             near = peak or evidence > found[0].evidence - settings.FAR_BEHIND
@@ -124,12 +125,15 @@ def afresh(
                 gaps.append(gap)
                 theta = np.concatenate([[m, m * (p0 - first), gap], xi])
                 begin = WindowFit(np.zeros(1), p0, theta, noise, walk_std=setup.walk_std)
-                fits.append(p.finished(p.fitted(
-                    p.step(begin, 1.0, held=True, begun=True), FIRST_STEPS)))
-        if not fits:  # slopes of 0
-            return None
-        best = max(fits, key=lambda f: f.evidence)
-        if best.valid and best.behind(xi) < 1.0:
+                begun[p.step(begin, 1.0, held=True, begun=True)] = evidence
+        free = [p.finished(p.fitted(f, FIRST_STEPS)) for f in begun]
+        # A fit further behind than its hypothesis was has lost its way: hold its gap for a while.
+        gains = np.array([f.evidence for f in free]) - [*begun.values()]
+        held = [_with_gap(p, f, f.gap, p.at(f).weights, -inf, 0.0)[1] for f, gain
+                in zip(begun, gains, strict=True) if gain < gains.max() - settings.FAR_BEHIND]
+        fits += [*free, *(p.finished(p.fitted(f, FIRST_STEPS)) for f in held)]
+        best = max(fits, key=lambda f: f.evidence, default=None)
+        if best is None or (best.valid and best.behind(xi) < 1.0):
             break
         xi = best.theta[3:]
     fits = sorted((f for f in fits if np.isfinite(f.evidence)), key=lambda f: -f.evidence)
@@ -137,7 +141,7 @@ def afresh(
         abs(f.gap - g.gap) >= 0.1 * sqrt(max(float(g.cov[2, 2]), 0.0)) for g in fits[:i])]
     likely = different[0].evidence - settings.FAR_BEHIND if different else inf
     fits = [p.finished(p.fitted(f)) for f in different if f.evidence > likely]
-    if not fits:  # even the best one has diverged
+    if not fits:  # slopes of 0, or even the best one has diverged
         return None
     best = max(fits, key=lambda f: f.evidence)
     if best.m < 0.0 or (older is None and best.left.turns < setup.turns_needed):

@@ -27,11 +27,12 @@ NEWEST = 300  # samples within which two commands are compared as a pair
 
 
 class Acting(NamedTuple):
-    """Which command acts in each interval: v and the other one (N,), residuals of y (N,), and which
-    of the open intervals are swapped (M,)."""
+    """Which command acts in each interval: v, the other one, and play output p, residuals of y, all
+    (N,), and which of the open intervals are swapped (M,)."""
 
     v: Array
     other: Array
+    p: Array
     residual: Array
     swapped: NDArray[np.bool_]
 
@@ -56,8 +57,8 @@ class OpenIntervals:
         # Correlated residuals are mostly due to the very commands that are looked for.
         self._noise = max(fit.noise * (0.25 if fit.systematic else 1.0), problem.nominal,
                           problem.step_of_readings / sqrt(12.0))
-        swapped = np.isin(record.first + self.at, list(already))
-        self.start = Acting(record.v, record.other, problem.at(fit).error, swapped)
+        run, swapped = problem.at(fit), np.isin(record.first + self.at, list(already))
+        self.start = Acting(record.v, record.other, run.p, run.error, swapped)
         self._settled = len(record.places(already)) - int(swapped.sum())
         # Most swaps move p in one interval only: their effect is that of a unit pulse, scaled.
         pulse = self._moved(np.eye(1, self._reach)[0])
@@ -75,18 +76,19 @@ class OpenIntervals:
 
     def swapped(self, acting: Acting, places: Sequence[int]) -> Acting:
         """The same with the other command in these of the open intervals."""
-        v, other = acting.v.copy(), acting.other.copy()
+        v, other, p = acting.v.copy(), acting.other.copy(), acting.p
         residual, swapped = acting.residual.copy(), acting.swapped.copy()
         for i in places:
             k = int(self.at[i])
-            residual[k:k + self._reach] -= self._added(k, v, other, self._play(v))
+            residual[k:k + self._reach] -= self._added(k, v, other, p)
             v[k], other[k], swapped[i] = other[k], v[k], not swapped[i]
-        return Acting(v, other, residual, swapped)
+            p = play(v, self._fit.gap, self._fit.p0)
+        return Acting(v, other, p, residual, swapped)
 
     def likeliest(self, acting: Acting, in_pairs: bool) -> list[int]:
         """The swap, or pair of swaps, that seems to gain most; none if none gains."""
-        v, other, _, swapped = acting
-        at, q, reach, gap, p = self.at, self._q, self._reach, self._fit.gap, self._play(v)
+        v, other, p, _, swapped = acting
+        at, q, reach, gap = self.at, self._q, self._reach, self._fit.gap
         rest = self._unexplained(acting)
         swap_to = np.clip(np.append(self._fit.p0, p[:-1])[at], other[at], other[at] + gap)
         moved, after = swap_to - p[at], np.minimum(at + 1, len(v) - 1)
@@ -106,9 +108,6 @@ class OpenIntervals:
         if in_pairs and pairs.max(initial=-inf) > max(gains.max(), 0.0):
             return [*map(int, self.newest[[*divmod(int(pairs.argmax()), len(pairs))]])]
         return [int(gains.argmax())] if gains.max() > 0.0 else []
-
-    def _play(self, v: Array) -> Array:
-        return play(v, self._fit.gap, self._fit.p0)
 
     def _moved(self, p: Array) -> Array:
         """Change of y by this change of p, both (..., N)."""

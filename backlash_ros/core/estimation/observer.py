@@ -66,9 +66,7 @@ class Observer:
 
     def correct(self, innovation: float) -> None:
         """Correct the state by an innovation, y minus its prediction."""
-        x = self.state
-        for i, k in enumerate(self._gain.gain):
-            x[i] += k * innovation
+        self.state = [x + k * innovation for x, k in zip(self.state, self._gain.gain, strict=True)]
         self.variance += (innovation * innovation - self.variance) / 100.0
 
     def settle(self, noise_std: float) -> None:
@@ -165,9 +163,7 @@ class Following:
 
         known: whether to trust the state of the fit more than newer samples.
         """
-        own, other = self.model.transfer_function, place.model
-        if not (np.array_equal(other.denominator, own.denominator)
-                and np.array_equal(other.numerator, own.numerator)):
+        if not place.model.equals(self.model.transfer_function):
             return  # another G was adopted meanwhile
         self.observer = observer = self.observer or Observer(self.model, noise_std, self._gains)
         observer.settle(noise_std)

@@ -59,6 +59,10 @@ class TransferFunction:
         """G at the points z."""
         return np.asarray(np.polyval(self.numerator, z) / np.polyval(self.denominator, z))
 
+    def equals(self, other: 'TransferFunction') -> bool:
+        return np.array_equal(self.numerator, other.numerator) \
+            and np.array_equal(self.denominator, other.denominator)
+
     def without_delay(self) -> tuple[list[float], list[float], int]:
         """Return b, a and the largest d [samples] with G = z^-d b/a where b/a still has a delay."""
         size = len(self.denominator)
