@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 from backlash_ros.core.parameters import ParameterError, Parameters
 from backlash_ros.options import BAD_INPUT, DONE, FAILED, print_any_text
+from backlash_ros.tools import leave
 from backlash_ros.tools.records.columns import parse_columns
 
 NOTHING = '–'  # stands in tables for a missing number
@@ -92,6 +93,8 @@ def run_tool(
     Call it from the main thread: SIGTERM stops the tool as Ctrl-C does.
     """
     print_any_text()
+    if signal.getsignal(signal.SIGINT) is leave:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     handler = signal.signal(signal.SIGTERM, signal.default_int_handler)
     # The interpreter takes a while to end: another Ctrl-C then would change the exit code.
     atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)

@@ -160,6 +160,27 @@ def is_gone(group: int) -> bool:
     return False
 
 
+INTERRUPTED = """
+import signal, sys
+
+class Interrupt:
+    def find_spec(name, *_):
+        if name == 'numpy':
+            signal.raise_signal(signal.SIGINT)
+
+sys.argv = ['/usr/lib/simulate']
+sys.meta_path.insert(0, Interrupt)
+import backlash_ros.tools.simulate
+print('imported')
+"""
+
+
+def test_an_interrupt_during_the_imports_ends_a_tool_in_one_line() -> None:
+    ended = subprocess.run([sys.executable, '-c', INTERRUPTED], capture_output=True, text=True,
+                           check=False, timeout=DEADLINE_S)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (1, '', 'interrupted\n')
+
+
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_interrupted_seeds_end_at_once_with_one_line(tmp_path: Path, number: int) -> None:
     command = [sys.executable, '-m', 'backlash_ros.tools.simulate', '--seeds', '4',
