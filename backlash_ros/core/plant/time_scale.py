@@ -4,11 +4,11 @@ from math import copysign, log
 
 import numpy as np
 
-from backlash_ros.core.plant.numerics import padded
 from backlash_ros.core.plant.transfer_function import ON_CIRCLE, Array, Roots, TransferFunction
 
 FASTER = log(2.0)  # largest |x|; a larger one has the same effect
 DEGREE = 8  # of the polynomials of x, which err by some 1e-7 of b
+TOGETHER = 1e-3  # relative distance of rates below which poles count as one: rounding splits them
 
 
 class ScaledNumerator:
@@ -23,14 +23,14 @@ class ScaledNumerator:
         self.early = max(len(poles) - len(b), 0)
         begun = np.append(np.zeros(self.early), b)
         powers = begun[None] if len(begun) > len(poles) else _polynomials(begun, poles)
-        if np.abs(powers[-1] - begun).max() > 1e-4 * np.abs(b).max():
+        if not np.abs(powers[-1] - begun).max() <= 1e-4 * np.abs(b).max():
             self.early, powers, begun = 0, b[None], b
         powers[-1] = begun
         self.size = len(begun)
         self._powers: list[list[float]] = powers.tolist()  # of x, the highest first
 
     def at(self, x: complex) -> list[complex]:
-        """B(x), from z^(early - delay) on; x may have a small imaginary part, as derivatives do."""
+        """B(x), (size,); x may be complex, for derivatives by a complex step."""
         x = x if abs(x.real) < FASTER else copysign(FASTER, x.real)
         b: list[complex] = [0j] * self.size
         for power in self._powers:
@@ -40,17 +40,21 @@ class ScaledNumerator:
 
 def _polynomials(b: Array, poles: Roots) -> Array:
     """B(x) of b (P,) by powers of x, the highest first: (DEGREE + 1, P)."""
-    n, modes = len(poles), np.log(np.append(poles, 1.0).astype(complex))
-    model, x = TransferFunction(b.tolist(), np.real(np.poly(poles)).tolist()), [0.0] * len(poles)
+    n, model = len(poles), TransferFunction(b.tolist(), np.real(np.poly(poles)).tolist())
+    x = [0.0] * n
     response = np.array([0.0, *(model.advance(x, 1.0) for _ in range(n))])
-    # The step response is a sum of exponentials of t, and of powers of t for poles at 1.
-    ones, t = np.abs(modes) < ON_CIRCLE, np.arange(n + 1)[:, None]
-    power = np.where(ones, np.cumsum(ones) - 1, 0)
+    # The step response is a sum of exponentials of t, times powers of t for poles that coincide.
+    rates = np.log(np.append(poles, 1.0).astype(complex))
+    modes, power, t = rates.copy(), np.zeros(n + 1, dtype=int), np.arange(n + 1)[:, None]
+    for i, mode in enumerate(rates):
+        alike = np.flatnonzero(np.abs(modes[:i] - mode) < TOGETHER * abs(mode) + ON_CIRCLE)
+        if alike.size:
+            modes[i], power[i] = modes[alike[0]], alike.size
     weights = np.linalg.lstsq(np.exp(t * modes) * t**power, response, rcond=None)[0]
     nodes = FASTER * np.cos(np.pi * (np.arange(DEGREE + 1) + 0.5) / (DEGREE + 1))  # Chebyshev
     values = np.zeros((DEGREE + 1, n))
     for row, s in zip(values, np.exp(nodes), strict=True):
         response = np.real(np.exp(s * t * modes) * (s * t) ** power @ weights)
-        row[:] = padded(np.convolve(np.real(np.poly(np.exp(s * modes))), response)[1:], n)
+        row[:] = np.convolve(np.real(np.poly(np.exp(s * rates[:-1]))), np.diff(response))[:n]
         row *= b.sum() / row.sum()
     return np.asarray(np.polyfit(nodes, values, DEGREE))

@@ -78,6 +78,7 @@ SCALED = {
     'integrator and zeros': ([0.2, 0.1, -0.05], [1.0, -2.5, 2.06, -0.56]),
     'equal poles': ([0.02, 0.01], [1.0, -1.6, 0.64]),
     'late': ([0.01], [1.0, -2.4, 1.94, -0.532, 0.0, 0.0]),
+    'two pairs of equal poles': ([0.02, 0.01, 0.02], np.poly([0.5, 0.5, 0.8, 0.8]).tolist()),
 }
 
 
@@ -92,8 +93,8 @@ def test_zeros_move_with_the_poles_of_a_faster_plant(
     pairs = len(poles) // 2
     moved = [np.log(faster), 0.0] * pairs + [np.log(faster)] * (len(poles) % 2)
     xi = [*[0.0] * (family.leaks + 2), *moved]
-    np.testing.assert_allclose(
-        family.model_at(xi).response(z), altered_plant(model, faster).response(z), rtol=2e-5)
+    true = altered_plant(model, faster).response(z)
+    assert np.abs(family.model_at(xi).response(z) - true).max() < 1e-5 * np.abs(true).max()
 
 
 def test_zeros_stay_where_no_continuous_plant_has_such_poles() -> None:
