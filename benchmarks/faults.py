@@ -3,6 +3,7 @@
     python benchmarks/faults.py --sequences 20000
     python benchmarks/faults.py --seed 45       what happens in one of them
     python benchmarks/faults.py --results FILE  add to FILE, and go on from what it holds
+    python benchmarks/faults.py --again          those that the campaign in docs/faults.md lists
 
 Each sequence is a loop of a random plant, law, structure, limits and noise, in simulated time: the
 core, the bookkeeping of samples and commands, and what the node decides around them; no middleware.
@@ -10,6 +11,7 @@ core, the bookkeeping of samples and commands, and what the node decides around 
 
 import json
 import os
+import re
 import sys
 import warnings
 from contextlib import nullcontext
@@ -62,15 +64,22 @@ def show(seed: int) -> int:
     return 0
 
 
+def listed() -> list[int]:
+    """Seeds of the sequences in which the campaign of the document found anything."""
+    campaign = DOCUMENT.read_text().partition('<!-- campaign:')[2].partition('<!-- end -->')[0]
+    cells = re.findall(r'\| ([\d, ]+) \|$', campaign, re.MULTILINE)
+    return sorted({int(seed) for cell in cells for seed in cell.split(',')})
+
+
 def rows_of(results: list[Result]) -> list[list[str]]:
     seeds = {kind: [str(one.seed) for one in results if kind in one.found] for kind in KINDS}
     return [[what, str(len(seeds[kind])), ', '.join(seeds[kind])] for kind, what in KINDS.items()]
 
 
-def summary(results: list[Result], first_seed: int) -> str:
+def summary(results: list[Result], which: str) -> str:
     hours = sum(result.samples for result in results) * PERIOD_S / 3600.0
     return (
-        f'{len(results)} sequences from seed {first_seed} on, {hours:.1f} h of simulated time, '
+        f'{len(results)} sequences {which}, {hours:.1f} h of simulated time, '
         f'{sum(result.commands for result in results)} commands; in '
         f'{sum(result.claimed for result in results)} of them a law with deviations said '
         '*tracking*.'
@@ -83,6 +92,8 @@ def main() -> int:
     parser.add_argument('--sequences', type=int, default=SEQUENCES, metavar='N')
     parser.add_argument('--first-seed', type=int, default=FIRST_SEED, metavar='S')
     parser.add_argument('--seed', type=int, metavar='K', help='show what happens in this one')
+    parser.add_argument('--again', action='store_true',
+                        help='only those in which the campaign of the document found anything')
     parser.add_argument('--processes', type=int, default=processors())
     parser.add_argument('--results', type=Path, metavar='FILE',
                         help='append what comes out; what it holds already is not played again')
@@ -92,7 +103,7 @@ def main() -> int:
     if arguments.seed is not None:
         return show(arguments.seed)
     first = arguments.first_seed
-    wanted = range(first, first + arguments.sequences)
+    wanted = listed() if arguments.again else range(first, first + arguments.sequences)
     path = arguments.results
     lines = path.read_text().splitlines() if path and path.exists() else []
     results = [one for one in (Result(*json.loads(line)) for line in lines) if one.seed in wanted]
@@ -106,10 +117,12 @@ def main() -> int:
                 print(json.dumps(result), file=file, flush=True)
             for kind, text in result.found.items():
                 print(f'{result.seed} ({result.loop}) {kind}: {text}', flush=True)
-    said, table = summary(results, first), (('found', 'sequences', 'seeds'), rows_of(results))
+    said = summary(results, 'listed above' if arguments.again else f'from seed {first} on')
+    table = ('found', 'sequences', 'seeds'), rows_of(results)
     print(f'{said}\n{format_table(*table)}')
     if arguments.write:
-        write_between(DOCUMENT, 'campaign', f'{said}\n\n{markdown_table(*table)}')
+        name = 'again' if arguments.again else 'campaign'
+        write_between(DOCUMENT, name, f'{said}\n\n{markdown_table(*table)}')
     found = {kind for result in results for kind in result.found}
     return int(bool(found & {'outside', 'too_fast', 'unbounded', 'broken'}))
 
