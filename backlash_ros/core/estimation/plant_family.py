@@ -43,7 +43,8 @@ class PlantFamily:
         self._rest: list[float] = np.atleast_1d(np.real(np.poly(rest))).tolist()
         self._pairs, self._nominal = sections_of(poles[moving])
         a = [x.real for x in denominator_of(self._pairs, *self._nominal)]
-        self._numerator = ScaledNumerator(b, poles if (moving | integrators).all() else poles[:0])
+        scaled = uncertainty > 0.0 and bool((moving | integrators).all())
+        self._numerator = ScaledNumerator(b, poles if scaled else poles[:0])
         self._gain, self._delay = sum(a), len(model.denominator) - len(b) - self._numerator.early
         # However short G is, a lag of one sample is usual: drivers apply v, or read y, that late.
         stable = TransferFunction(b.tolist(), padded(np.array(a), len(model.denominator)).tolist())
