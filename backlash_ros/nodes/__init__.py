@@ -4,11 +4,11 @@ import os
 import signal
 import sys
 
+from backlash_ros import starts_one_of
 from backlash_ros.middleware import ROS_MISSING, ros_is_missing
 
-# With -m, sys.argv[0] is '-m' until the module is found; else it is the installed script.
-if sys.argv and os.path.basename(sys.argv[0]) in (
-    '-m', 'controller', 'plant', 'reference', 'recorder', 'check_driver', 'monitor', 'live',
+if starts_one_of(
+    'controller', 'plant', 'reference', 'recorder', 'check_driver', 'monitor', 'live',
 ):
     for _number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(_number, lambda number, frame: os._exit(0))

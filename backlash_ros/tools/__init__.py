@@ -2,9 +2,9 @@
 
 import os
 import signal
-import sys
 from types import FrameType
 
+from backlash_ros import starts_one_of
 from backlash_ros.options import FAILED, use_one_thread
 
 
@@ -14,11 +14,10 @@ def leave(_: int, frame: FrameType | None) -> None:
     os._exit(FAILED)
 
 
-# With -m, sys.argv[0] is '-m' until the module is found; else it is the installed script. Where
-# SIGINT is ignored, as in the background of a script, it stays so.
-if sys.argv and os.path.basename(sys.argv[0]) in (
-    '-m', 'bringup', 'simulate', 'report', 'compare', 'identify', 'replay',
-) and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+# Where SIGINT is ignored, as in the background of a script, it stays so.
+if signal.getsignal(signal.SIGINT) is signal.default_int_handler and starts_one_of(
+    'bringup', 'simulate', 'report', 'compare', 'identify', 'replay',
+):
     signal.signal(signal.SIGINT, leave)
 
 use_one_thread()

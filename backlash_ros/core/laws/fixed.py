@@ -69,7 +69,8 @@ class FixedBacklash(Law):
 
     def predicted(self, u: float) -> float:
         """Prediction of y(k+1) if the backlash puts out this u."""
-        return self._c * (dot(self._rows[0], self._x) + self._b[0] * u)
+        self.prepare()
+        return self._c * (self._x_ahead[0] + self._b[0] * u)
 
     def update(self, y: float | None, interval: Interval) -> None:
         self.prepare()

@@ -15,8 +15,8 @@ class ScaledNumerator:
     """Numerator B(x) of G(s e^-x) = B/A sampled with u held; its sum does not change.
 
     b: at x = 0, from the first effect on y on, (M,). poles: of G(z), none at 0 or on the negative
-    axis, (P,). early: samples by which B(x) begins before b. size: number of its coefficients.
-    B is always b if that has more than P coefficients, or poles lie too close to each other.
+    axis, (P,). early: samples by which B(x) begins before b. B is always b if that has more than P
+    coefficients, or poles lie too close to each other.
     """
 
     def __init__(self, b: Array, poles: Roots) -> None:
@@ -26,13 +26,12 @@ class ScaledNumerator:
         if not np.abs(powers[-1] - begun).max() <= 1e-4 * np.abs(b).max():
             self.early, powers, begun = 0, b[None], b
         powers[-1] = begun
-        self.size = len(begun)
         self._powers: list[list[float]] = powers.tolist()  # of x, the highest first
 
     def at(self, x: complex) -> list[complex]:
-        """B(x), (size,); x may be complex, for derivatives by a complex step."""
+        """B(x), (early + M,); x may be complex, for derivatives by a complex step."""
         x = x if abs(x.real) < FASTER else copysign(FASTER, x.real)
-        b: list[complex] = [0j] * self.size
+        b = [0j] * len(self._powers[0])
         for power in self._powers:
             b = [value * x + each for value, each in zip(b, power, strict=True)]
         return b
@@ -57,4 +56,4 @@ def _polynomials(b: Array, poles: Roots) -> Array:
         response = np.real(np.exp(s * t * modes) * (s * t) ** power @ weights)
         row[:] = np.convolve(np.real(np.poly(np.exp(s * rates[:-1]))), np.diff(response))[:n]
         row *= b.sum() / row.sum()
-    return np.asarray(np.polyfit(nodes, values, DEGREE))
+    return np.linalg.solve(np.vander(nodes), values)

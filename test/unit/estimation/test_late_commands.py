@@ -88,6 +88,4 @@ def test_late_commands_around_an_integrator_do_not_mislead(seed: int) -> None:
     states, errors = run(seed, 1500)
     assert Status.INCONSISTENT not in states
     assert states[-1] is Status.TRACKING
-    # Which of a few neighbouring commands was late hardly shows in y, so that which ones are taken
-    # for late depends on the last bits of every number, and with them m by up to a hundredth.
-    assert np.abs(errors).max() < 2e-2
+    assert np.abs(errors).max() < 5e-3
