@@ -340,7 +340,7 @@ class JointLoops:
         self._commands: dict[str, float] = {}  # to be sent in the next message
         self.by_name = {
             joint: ControlLoop(
-                p.of_joint(joint), partial(self._commands.__setitem__, joint), driver(joint),
+                p.of_joint(joint), self._sender_of(joint, len(p.joint_names)), driver(joint),
                 before.get(joint), counter, (v or {}).get(joint), executor,
             ) for joint in p.joint_names
         }
@@ -398,6 +398,11 @@ class JointLoops:
         sent = [loop.send_next() for loop in self.loops]
         self._send_waiting()
         return any(sent)
+
+    def _sender_of(self, joint: str, joints: int) -> Callable[[float], None]:
+        if joints == 1:  # it leaves at once, and is noted afterwards
+            return lambda v: self._send({joint: v})
+        return partial(self._commands.__setitem__, joint)
 
     def _send_waiting(self) -> None:
         if self._commands:

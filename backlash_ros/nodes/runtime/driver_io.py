@@ -21,7 +21,7 @@ from backlash_ros.core.loop.sample_counter import Output, Timing
 from backlash_ros.core.loop.wall_clock import WallClock
 from backlash_ros.core.parameters import ParameterError, Parameters
 from backlash_ros.nodes.runtime import messages
-from backlash_ros.nodes.runtime.executor import serve_polled
+from backlash_ros.nodes.runtime.executor import server_of
 from backlash_ros.nodes.runtime.messages import DEPTH, JointMessage, line_of, name_of
 from backlash_ros.nodes.runtime.process import ProcessNode
 
@@ -94,6 +94,7 @@ class DriverIo:
         self._newest: dict[str, float] = {}  # v by joint
         self._referred = JointMessage()  # the newest message of references
         self.heard: dict[str, Subscription] = {}
+        self._waiting: list[Callable[[], None]] = []  # serve the references and the reports
 
     @cached_property
     def simulated_time(self) -> bool:
@@ -189,13 +190,15 @@ class DriverIo:
                 self._referred = message
             hear(self.values(message), info, message)
 
-        self.heard[topic] = self._node.listen(kind, topic, hear_content, qos, True, polled)
-        return self.heard[topic]
+        self.heard[topic] = heard = self._node.listen(kind, topic, hear_content, qos, True, polled)
+        if polled and topic != self.topics.output:
+            self._waiting.append(server_of(heard))
+        return heard
 
     def serve_waiting(self) -> None:
-        """Take the waiting references and reports; not in lockstep, where neither is polled."""
-        for topic in (self.topics.reference, self.topics.applied):
-            serve_polled(self.heard[topic])
+        """Take the waiting references and reports; in lockstep neither is polled."""
+        for serve in self._waiting:
+            serve()
 
     def values(self, message: Sequence[float] | JointMessage) -> dict[str, float]:
         """The values in a message for the joints of this node, by their names."""

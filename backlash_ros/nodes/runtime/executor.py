@@ -5,6 +5,7 @@ All uses of internals of rclpy, in its version for ROS 2 Jazzy, are in this file
 
 import time
 from collections.abc import Callable
+from math import inf
 from typing import Any, cast
 
 from lifecycle_msgs.srv import ChangeState
@@ -24,12 +25,22 @@ class Polled(MutuallyExclusiveCallbackGroup):
 
 def serve_polled(subscription: Subscription) -> None:
     """Call the callback of a polled subscription with each waiting message, oldest first."""
-    take, callback = subscription.handle.take_message, subscription.callback
-    # At most as many as the queue holds.
-    left = subscription.qos_profile.depth
-    while left and (taken := take(subscription.msg_type, subscription.raw)) is not None:
-        callback(*taken)
-        left -= 1
+    server_of(subscription)()
+
+
+def server_of(subscription: Subscription) -> Callable[[], None]:
+    """Return the function that serves this polled subscription."""
+    # After a pause, to look up an attribute of rclpy costs microseconds: all are looked up now.
+    take, callback, raw = subscription.handle.take_message, subscription.callback, subscription.raw
+    message_type, depth = subscription.msg_type, subscription.qos_profile.depth
+
+    def serve() -> None:
+        for _ in range(depth):  # at most as many as the queue holds
+            if (taken := take(message_type, raw)) is None:
+                return
+            callback(*taken)
+
+    return serve
 
 
 def refuse_unfit_transitions(node: Node) -> None:
@@ -54,6 +65,7 @@ class PromptExecutor(SingleThreadedExecutor):
     The executor of rclpy builds a wait set of all entities for each message, which takes longer
     than to answer it. This one keeps a wait set of subscriptions, calls timers when they are due,
     and leaves the rest to rclpy five times a second. It wakes up as often, for signals.
+    due: when to wake up once for an action, on the monotonic clock [ns], and the action.
     """
 
     def __init__(self, node: Node) -> None:
@@ -66,6 +78,7 @@ class PromptExecutor(SingleThreadedExecutor):
         self._served: list[tuple[Any, ...]] = []
         self._wait_set: Any = None
         self._look_at_ns = self._rclpy_at_ns = 0  # when timers are due, and all else
+        self.due: tuple[float, Callable[[], object]] = inf, bool
 
     def can_execute(self, entity: Any) -> bool:
         return not isinstance(entity, (Subscription, Timer)) and bool(super().can_execute(entity))
@@ -76,12 +89,18 @@ class PromptExecutor(SingleThreadedExecutor):
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
         """Serve one message of each topic and whatever is due, after waiting until that at most."""
-        wait_ns = self._look_at_ns - time.monotonic_ns()
+        wait_ns = int(min(self._look_at_ns, self.due[0])) - time.monotonic_ns()
         if timeout_sec is not None:
             wait_ns = min(wait_ns, int(timeout_sec * 1e9))
-        # After a message, what is soon due is done now: later it might delay the next message,
-        # which mostly comes within 12 ms.
-        self.look_if_due(ahead_ns=12_000_000 if self.serve_urgent(max(wait_ns, 0)) else 0)
+        if self.serve_urgent(max(wait_ns, 0)):
+            # What is soon due is done now: later it might delay the next message, which mostly
+            # comes within 12 ms.
+            self.look_if_due(ahead_ns=12_000_000)
+            return
+        if time.monotonic_ns() >= self.due[0]:
+            (_, act), self.due = self.due, (inf, bool)
+            act()
+        self.look_if_due()
 
     def serve_urgent(self, wait_ns: int) -> bool:
         """Wait wait_ns at most and serve one message of each topic; returns whether any came."""

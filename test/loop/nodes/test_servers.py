@@ -2,6 +2,7 @@
 
 import socket
 import threading
+import time
 from collections.abc import Callable, Iterator
 
 import pytest
@@ -80,6 +81,16 @@ def loop() -> Iterator[Loop]:
         loop = Loop(domain)
         yield loop
         loop.close()
+
+
+def test_a_node_is_woken_once_for_what_is_due(loop: Loop) -> None:
+    calls: list[str] = []
+    loop.executor.due = time.monotonic_ns() + 1e12, lambda: calls.append('too early')
+    loop.executor.spin_once(timeout_sec=0.0)
+    loop.executor.due = time.monotonic_ns() + 1e7, lambda: calls.append('due')
+    loop.spin_until(lambda: calls, 'what is due')
+    loop.executor.spin_once(timeout_sec=0.0)
+    assert calls == ['due']
 
 
 def test_a_flood_of_messages_stops_neither_timers_nor_services(loop: Loop) -> None:
