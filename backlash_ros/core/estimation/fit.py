@@ -27,6 +27,8 @@ from backlash_ros.core.plant.numerics import lfilter, padded, sensitivities, shi
 from backlash_ros.core.plant.transfer_function import Array, Family
 
 STEPS, FIRST_STEPS, FEW_STEPS = 16, 6, 3  # limits on the number of Gauss-Newton steps
+# Largest s in the first steps: far away, errors of the linearization would pass for errors of G.
+FAR_AWAY = 0.1, 0.3, 1.0, 1.0
 
 
 class Run(NamedTuple):
@@ -214,15 +216,12 @@ class Problem:
 
     def fitted(self, f: WindowFit, steps: int = STEPS, least_gain: float = 0.0) -> WindowFit:
         """Take Gauss-Newton steps from f until they converge or gain under `least_gain` nats."""
-        # Number of first steps in which s is at most 1: G no more wrong than configured.
-        far_steps = 4 * (self.family.count > self.family.leaks)
+        far = iter(FAR_AWAY if self.family.count > self.family.leaks and steps > FEW_STEPS else ())
         # A gap that moves by fewer standard deviations has converged, unless 1 nat is still gained.
         least_move = 0.02 if steps > FEW_STEPS else 0.2
-        for k in range(steps):
-            weights = self.at(f).weights
+        for _ in range(steps):
+            weights, most = self.at(f).weights, next(far, inf)
             best = self.log_posterior(f, weights)
-            # Far from the optimum, errors of the linearization would be taken for errors of G.
-            most = 1.0 if k < far_steps < steps else inf
             new, there, value = self._stepped(f, best, weights, most, False, False)
             if not value > best - 0.5:
                 # A kink at p0, or an undetermined gap, may block progress: hold p0, or the gap.
@@ -244,7 +243,7 @@ class Problem:
             if value - best < (1.0 if moved < least_move else least_gain):
                 if most == inf:
                     break
-                far_steps = 0
+                far = iter(())
         return f
 
     def _stepped(
