@@ -175,14 +175,19 @@ class Problem:
         at = len(r) - 4 - self.family.count
         return Prior(r[at:-1, at:-1], r[at:-1, -1])
 
+    def unknowns(self, f: WindowFit) -> Array:
+        """X, knots, p0, m, o, g and xi, in this order: (P,)."""
+        x = padded(f.x, len(self.at(f).a) - 1)
+        return np.concatenate([x, self._walk_of(f)[1], [f.p0], f.theta])
+
     def rows(self, f: WindowFit, held: bool = False, begun: bool = False) -> Array:
         """Least-squares rows of a step: N samples, B priors; target last, (N + B, P + 1)."""
         vague = 100.0  # prior standard deviation of X, over the largest reading
         tight = 1e6  # weight by which an unknown keeps its value
         run, jacobian, first = self.at(f), self.jacobian(f), self.v[0]
         _, score, information = run.likelihood
-        (_, knots, knot_std), x = self._walk_of(f), padded(f.x, len(run.a) - 1)
-        beta = np.concatenate([x, knots, [f.p0], f.theta])
+        (_, knots, knot_std), beta = self._walk_of(f), self.unknowns(f)
+        x = beta[:len(run.a) - 1]
         of_samples = np.vstack([jacobian.T, jacobian @ beta + score / information])
         of_samples *= np.sqrt(information * run.weights)
         at = len(x) + len(knots) + 1  # index of m
