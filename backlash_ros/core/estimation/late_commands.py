@@ -53,11 +53,12 @@ class Decisions:
         self._record, self._fit, self._run, self._begin = record, fit, problem.at(fit), begin
         self._jacobian, self._swapped = problem.jacobian(fit), swapped
         self._weights, self._open = self._run.weights * problem.known, np.isfinite(record.other)
+        self._a, self._b = np.array(self._run.a), np.array(self._run.b)
         self._of_b = setup.family.slopes(fit.xi)[0]
         self._m_at = self._jacobian.shape[1] - setup.family.count - 3
         self._noise_std = max(problem.nominal, problem.step_of_readings / sqrt(12.0))
         # Less than this cannot outweigh the prior odds.
-        pulse = lfilter(self._run.b, self._run.a, fit.m * np.eye(1, len(record.v))[0])
+        pulse = lfilter(self._b, self._a, fit.m * np.eye(1, len(record.v))[0])
         gains = 0.5 * (record.v - record.other) ** 2 * float(pulse @ pulse) / self._noise_std**2
         self._asked = self._open & (gains > log(self._open.sum() + 1.0))
         # Prior rows of the unknowns, minus those of the fit; weak ones for m, o and xi.
@@ -72,17 +73,16 @@ class Decisions:
 
     def likeliest(self) -> NDArray[np.bool_]:
         """Which commands to swap, (N,)."""
-        count, k, run, w = len(self._record.v), self._begin, self._run, self._weights
-        rows = np.column_stack([self._jacobian[:k], run.error[:k]]) * np.sqrt(w[:k])[:, None]
+        count, begin, run, w = len(self._record.v), self._begin, self._run, self._weights
+        rows = np.column_stack([self._jacobian, run.error])[:begin] * np.sqrt(w[:begin])[:, None]
         r = triangle(np.vstack([rows, self._prior]))
         root = np.linalg.inv(r[:-1, :-1])
-        squares = float(r[-1, -1]) ** 2 + self._noise_std**2
         now = Hypotheses(*(np.array([each]) for each in (
-            0.0, float(self._swapped[:k].sum()), run.p[k - 1] if k else self._fit.p0,
-            np.zeros(len(run.a)), root @ r[:-1, -1], root, squares)))
+            0.0, self._swapped[:begin].sum(), run.p[begin - 1] if begin else self._fit.p0,
+            np.zeros(len(self._a)), root @ r[:-1, -1], root, r[-1, -1] ** 2 + self._noise_std**2)))
         readings, decided = 1.0 + np.cumsum(w) - w, np.cumsum(self._open) - self._open
         ways = list[tuple[NDArray[np.intp], NDArray[np.bool_]]]()
-        for k in range(self._begin, count):
+        for k in range(begin, count):
             now, parents, other = self._decided(now, k, float(decided[k]))
             now = self._heard(now, k, float(readings[k]))
             best = np.argsort(-now.value, kind='stable')[:KEPT]
@@ -91,7 +91,7 @@ class Decisions:
             now = Hypotheses(*(each[best] for each in now))
             ways.append((parents[best], other[best]))
         swap, at = np.zeros(count, np.bool_), int(now.value.argmax())
-        for k in range(count - 1, self._begin - 1, -1):
+        for k in range(count - 1, begin - 1, -1):
             parents, other = ways.pop()
             swap[k], at = other[at], parents[at]
         return swap
@@ -115,7 +115,7 @@ class Decisions:
             parents, p = np.append(parents, parents[differ]), np.append(p, p_other[differ])
             other, chance = np.append(other, differ[differ]), np.append(chance, odds[1])
         before = Hypotheses(*(each[parents] for each in now))
-        newest = p - self._run.p[k] - before.moved[:, :-1] @ self._run.a[1:]
+        newest = p - self._run.p[k] - before.moved[:, :-1] @ self._a[1:]
         late = before.late + ((other != self._swapped[k]) & self._open[k])
         return before._replace(
             value=before.value + chance, late=late, p=p,
@@ -123,10 +123,10 @@ class Decisions:
 
     def _heard(self, now: Hypotheses, k: int, readings: float) -> Hypotheses:
         """The hypotheses after y(k); readings: number of those before."""
-        weight, m, taps = self._weights[k], self._fit.m, now.moved[:, :len(self._run.b)]
+        weight, m, taps = self._weights[k], self._fit.m, now.moved[:, :len(self._b)]
         if not weight:
             return now
-        by_p, rows = taps @ self._run.b, np.repeat(self._jacobian[k:k + 1], len(taps), axis=0)
+        by_p, rows = taps @ self._b, np.repeat(self._jacobian[k:k + 1], len(taps), axis=0)
         rows[:, self._m_at] += by_p
         rows[:, self._m_at + 3:] += m * taps @ self._of_b.T
         error = self._run.error[k] - m * by_p - (rows * now.unknowns).sum(axis=1)
