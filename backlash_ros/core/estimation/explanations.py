@@ -68,8 +68,9 @@ class Setup:
         return f.systematic and f.unexplained > settings.NEGLIGIBLE and self.family.count > 0
 
     def moves_against(self, f: WindowFit) -> bool:
-        """Whether y moves against v: m is negative, with a size within the bounds of m."""
-        return self.bounds.m[0] <= -f.m <= self.bounds.m[1]
+        """Whether y moves against v: m is negative for certain, with a size within its bounds."""
+        certain = -f.m > settings.BY_CHANCE * float(std_of(f.crossings_cov)[0])
+        return certain and self.bounds.m[0] <= -f.m <= self.bounds.m[1]
 
     def noisier(self, f: WindowFit) -> bool:
         """Whether readings are noisier than nominal noise or quantization makes them."""

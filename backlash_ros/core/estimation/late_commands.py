@@ -65,8 +65,7 @@ class Decisions:
         rows, unknowns = problem.rows(fit)[len(record.v):], problem.unknowns(fit)
         weak = np.eye(len(unknowns) + 1)[self._m_at:]
         weak[3:-1, -1] = -fit.theta[3:]
-        of_o = fit.m * float(np.ptp(record.v))
-        stds = [fit.m, of_o, inf, *[max(fit.scale, 1.0)] * setup.family.count, inf]
+        stds = [fit.m, fit.m * np.ptp(record.v), inf, *[max(fit.scale, 1.0)] * len(fit.xi), inf]
         weak /= np.array(stds)[:, None]
         rows = np.column_stack([rows[:, :-1], rows[:, -1] - rows[:, :-1] @ unknowns])
         self._prior = self._noise_std * np.vstack([rows, weak])
