@@ -27,8 +27,6 @@ from backlash_ros.core.plant.numerics import lfilter, padded, sensitivities, shi
 from backlash_ros.core.plant.transfer_function import Array, Family
 
 STEPS, FIRST_STEPS, FEW_STEPS = 16, 6, 3  # limits on the number of Gauss-Newton steps
-# Largest s in the first steps: far away, errors of the linearization would pass for errors of G.
-FAR_AWAY = 0.1, 0.3, 1.0, 1.0
 
 
 class Run(NamedTuple):
@@ -153,12 +151,11 @@ class Problem:
         xi, cov_xi, scale, volume, noise = posterior.error_of_plant(
             f, r[n:, n:], squares, freedom, most_scale)
         beta = of_eta @ r[:n, -1] + of_xi @ xi
-        swing, first, p0 = float(np.ptp(self.v)), float(self.v[0]), float(beta[at - 1])
+        swing, first = float(np.ptp(self.v)), float(self.v[0])
         # With a gap of exactly 0, both sides would be engaged at once.
         beta[at + 2] = gap = min(max(beta[at + 2], 1e-9 * swing), 2.0 * swing)
+        p0 = float(beta[at - 1])
         cov = noise * of_eta @ of_eta.T + of_xi @ cov_xi @ of_xi.T
-        # X of another delay has another length: each explains as many of the first readings.
-        volume -= order * log(self.step_of_readings or self.nominal)
         volume -= float(np.log(np.maximum(diagonal, 1e-300)).sum())
         _, knots, knot_std = self._walk_of(f)
         return replace(f, x=beta[:order], knots=beta[order:at - 1], theta=beta[at:],
@@ -175,19 +172,14 @@ class Problem:
         at = len(r) - 4 - self.family.count
         return Prior(r[at:-1, at:-1], r[at:-1, -1])
 
-    def unknowns(self, f: WindowFit) -> Array:
-        """X, knots, p0, m, o, g and xi, in this order: (P,)."""
-        x = padded(f.x, len(self.at(f).a) - 1)
-        return np.concatenate([x, self._walk_of(f)[1], [f.p0], f.theta])
-
     def rows(self, f: WindowFit, held: bool = False, begun: bool = False) -> Array:
         """Least-squares rows of a step: N samples, B priors; target last, (N + B, P + 1)."""
         vague = 100.0  # prior standard deviation of X, over the largest reading
         tight = 1e6  # weight by which an unknown keeps its value
         run, jacobian, first = self.at(f), self.jacobian(f), self.v[0]
         _, score, information = run.likelihood
-        (_, knots, knot_std), beta = self._walk_of(f), self.unknowns(f)
-        x = beta[:len(run.a) - 1]
+        (_, knots, knot_std), x = self._walk_of(f), padded(f.x, len(run.a) - 1)
+        beta = np.concatenate([x, knots, [f.p0], f.theta])
         of_samples = np.vstack([jacobian.T, jacobian @ beta + score / information])
         of_samples *= np.sqrt(information * run.weights)
         at = len(x) + len(knots) + 1  # index of m
@@ -221,12 +213,15 @@ class Problem:
 
     def fitted(self, f: WindowFit, steps: int = STEPS, least_gain: float = 0.0) -> WindowFit:
         """Take Gauss-Newton steps from f until they converge or gain under `least_gain` nats."""
-        far = iter(FAR_AWAY if self.family.count > self.family.leaks and steps > FEW_STEPS else ())
+        # Number of first steps in which s is at most 1: G no more wrong than configured.
+        far_steps = 4 * (self.family.count > self.family.leaks)
         # A gap that moves by fewer standard deviations has converged, unless 1 nat is still gained.
         least_move = 0.02 if steps > FEW_STEPS else 0.2
-        for _ in range(steps):
-            weights, most = self.at(f).weights, next(far, inf)
+        for k in range(steps):
+            weights = self.at(f).weights
             best = self.log_posterior(f, weights)
+            # Far from the optimum, errors of the linearization would be taken for errors of G.
+            most = 1.0 if k < far_steps < steps else inf
             new, there, value = self._stepped(f, best, weights, most, False, False)
             if not value > best - 0.5:
                 # A kink at p0, or an undetermined gap, may block progress: hold p0, or the gap.
@@ -248,7 +243,7 @@ class Problem:
             if value - best < (1.0 if moved < least_move else least_gain):
                 if most == inf:
                     break
-                far = iter(())
+                far_steps = 0
         return f
 
     def _stepped(

@@ -1,13 +1,15 @@
-"""Decides which of two commands acted in each interval where the newer one may have come too late.
+"""Decides which of two commands acted in an interval, where the newer one may have come too late.
 
-Each sequence of decisions is a hypothesis with a recursive least squares of its own, linearized at
-a fit: what it predicts has Student-t densities, the noise being integrated out. Prior odds, after k
-of n commands were late: k + 1/2 to n - k + 1/2 (Jeffreys). At each sample the likeliest go on: the
-M-algorithm (J. B. Anderson, S. Mohan, IEEE Trans. Communications 32 (1984) 169-176).
+If the command that is not in the record acted, it would add s to y. With residuals r, this raises
+the log-likelihood by (s.r - s.s / 2) / sigma^2 (A. S. Willsky, H. L. Jones, IEEE Trans. Automatic
+Control 21 (1976)). Prior odds, after k of n commands were late: k + 1/2 to n - k - 1/2 (Jeffreys).
+The likeliest swap is made first, and the rest compared again, until none is likely; as two late
+commands soon after each other look like one between them, pairs are compared, too.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
-from math import exp, inf, lgamma, log, sqrt
+from math import exp, inf, lgamma, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -16,129 +18,120 @@ from numpy.typing import NDArray
 from backlash_ros.core.estimation import settings
 from backlash_ros.core.estimation.explanations import Setup, afresh, apart
 from backlash_ros.core.estimation.posterior import Prior, WindowFit
-from backlash_ros.core.plant.numerics import lfilter, triangle
+from backlash_ros.core.plant.backlash import play
+from backlash_ros.core.plant.numerics import basis, lfilter
 from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.window import Window
 
-KEPT, BEHIND = 50, 40.0  # how many hypotheses go on, and how far behind the likeliest [nats]
-NEWEST = 4 * settings.ROWS  # samples within which decisions are open
+NEWEST = 300  # samples within which two commands are compared as a pair
 
 
-class Hypotheses(NamedTuple):
-    """What H hypotheses say after a sample; the first one is that of the record as it is.
+class Acting(NamedTuple):
+    """Which command acts in each interval: v, the other one, and play output p, residuals of y, all
+    (N,), and which of the open intervals are swapped (M,)."""
 
-    value: log-probability (H,). late: number of late commands (H,). p: play output (H,). moved: p
-    minus that of the record, filtered by 1 / A, newest samples first (H, T). unknowns: minus those
-    of the fit (H, P). root: square root of their covariance over the noise variance (H, P, P).
-    squares: of the errors of all predictions (H,).
+    v: Array
+    other: Array
+    p: Array
+    residual: Array
+    swapped: NDArray[np.bool_]
+
+
+class OpenIntervals:
+    """The intervals of a record, from sample `since` on, in which another command may have acted.
+
+    at: their indices (M,). newest: which of them are compared as pairs. start: with the commands
+    `already` swapped. Of residuals only what the unknowns of the fit cannot explain counts.
     """
 
-    value: Array
-    late: Array
-    p: Array
-    moved: Array
-    unknowns: Array
-    root: Array
-    squares: Array
-
-
-class Decisions:
-    """The decisions in a record from its sample `begin` on; swapped: where it is late now (N,)."""
-
     def __init__(
-        self, setup: Setup, record: Window, fit: WindowFit, swapped: NDArray[np.bool_],
-        older: Prior | None, begin: int,
+        self, setup: Setup, record: Window, fit: WindowFit, already: frozenset[int],
+        older: Prior | None, since: int = 0,
     ) -> None:
-        problem = setup.problem(record, older)
-        self._record, self._fit, self._run, self._begin = record, fit, problem.at(fit), begin
-        self._jacobian, self._swapped = problem.jacobian(fit), swapped
-        self._weights, self._open = self._run.weights * problem.known, np.isfinite(record.other)
-        self._a, self._b = np.array(self._run.a), np.array(self._run.b)
-        self._of_b = setup.family.slopes(fit.xi)[0]
-        self._m_at = self._jacobian.shape[1] - setup.family.count - 3
-        self._noise_std = max(problem.nominal, problem.step_of_readings / sqrt(12.0))
-        # Less than this cannot outweigh the prior odds.
-        pulse = lfilter(self._b, self._a, fit.m * np.eye(1, len(record.v))[0])
-        gains = 0.5 * (record.v - record.other) ** 2 * float(pulse @ pulse) / self._noise_std**2
-        self._asked = self._open & (gains > log(self._open.sum() + 1.0))
-        # Prior rows of the unknowns, minus those of the fit; weak ones for m, o and xi.
-        rows, unknowns = problem.rows(fit)[len(record.v):], problem.unknowns(fit)
-        weak = np.eye(len(unknowns) + 1)[self._m_at:]
-        weak[3:-1, -1] = -fit.theta[3:]
-        stds = [fit.m, fit.m * np.ptp(record.v), inf, *[max(fit.scale, 1.0)] * len(fit.xi), inf]
-        weak /= np.array(stds)[:, None]
-        rows = np.column_stack([rows[:, :-1], rows[:, -1] - rows[:, :-1] @ unknowns])
-        self._prior = self._noise_std * np.vstack([rows, weak])
+        every = np.flatnonzero(np.isfinite(record.other))
+        self.at, self._count = every[every >= since - record.first], len(every)
+        problem, self._fit = setup.problem(record, older), fit
+        self._reach = settings.ROWS if setup.family.integrates else setup.family.memory
+        self._known, self._plant = problem.known.astype(np.float64), setup.family.at(fit.xi)
+        self._q = basis(problem.jacobian(fit) * self._known[:, None])
+        # Correlated residuals are mostly due to the very commands that are looked for.
+        self._noise = max(fit.noise * (0.25 if fit.systematic else 1.0), problem.nominal,
+                          problem.step_of_readings / sqrt(12.0))
+        run, swapped = problem.at(fit), np.isin(record.first + self.at, list(already))
+        self.start = Acting(record.v, record.other, run.p, run.error, swapped)
+        self._settled = len(record.places(already)) - int(swapped.sum())
+        # Most swaps move p in one interval only: their effect is that of a unit pulse, scaled.
+        pulse = self._moved(np.eye(1, self._reach)[0])
+        self._squares = np.correlate(np.pad(self._known, (0, self._reach - 1)), pulse**2)[self.at]
+        self._squares -= (self._along(self._q.T) ** 2).sum(axis=0)
+        begin = max(len(record.v) - NEWEST, 0)
+        self.newest = np.flatnonzero(self.at >= begin)
+        pulses = self._moved(np.eye(len(record.v) - begin)[self.at[self.newest] - begin])
+        pulses, q = pulses * self._known[begin:], self._q[begin:]
+        self._products = pulses @ pulses.T - (pulses @ q) @ (pulses @ q).T
 
-    def likeliest(self) -> NDArray[np.bool_]:
-        """Which commands to swap, (N,)."""
-        count, begin, run, w = len(self._record.v), self._begin, self._run, self._weights
-        rows = np.column_stack([self._jacobian, run.error])[:begin] * np.sqrt(w[:begin])[:, None]
-        r = triangle(np.vstack([rows, self._prior]))
-        root = np.linalg.inv(r[:-1, :-1])
-        now = Hypotheses(*(np.array([each]) for each in (
-            0.0, self._swapped[:begin].sum(), run.p[begin - 1] if begin else self._fit.p0,
-            np.zeros(len(self._a)), root @ r[:-1, -1], root, r[-1, -1] ** 2 + self._noise_std**2)))
-        readings, decided = 1.0 + np.cumsum(w) - w, np.cumsum(self._open) - self._open
-        ways = list[tuple[NDArray[np.intp], NDArray[np.bool_]]]()
-        for k in range(begin, count):
-            now, parents, other = self._decided(now, k, float(decided[k]))
-            now = self._heard(now, k, float(readings[k]))
-            best = np.argsort(-now.value, kind='stable')[:KEPT]
-            best = best[now.value[best] > now.value[best[0]] - BEHIND]
-            best = np.append(0, best[best > 0])  # the record itself is always among them
-            now = Hypotheses(*(each[best] for each in now))
-            ways.append((parents[best], other[best]))
-        swap, at = np.zeros(count, np.bool_), int(now.value.argmax())
-        for k in range(count - 1, begin - 1, -1):
-            parents, other = ways.pop()
-            swap[k], at = other[at], parents[at]
-        return swap
+    def log_posterior(self, acting: Acting) -> float:
+        rest = self._unexplained(acting)
+        return self._prior_of(acting) - 0.5 * float(rest @ rest) / self._noise**2
 
-    def _decided(
-        self, now: Hypotheses, k: int, decided: float,
-    ) -> tuple[Hypotheses, NDArray[np.intp], NDArray[np.bool_]]:
-        """All, with both commands in interval k, after so many decisions; their parents, and which
-        have the other command."""
-        gap, v, v_other = self._fit.gap, self._record.v[k], self._record.other[k]
-        parents: NDArray[np.intp] = np.arange(len(now.p))
-        p: Array = np.clip(now.p, v, v + gap)
-        other: NDArray[np.bool_] = np.zeros(len(p), np.bool_)
-        chance: Array = np.zeros(len(p))
-        if self._asked[k]:
-            p_other = np.clip(now.p, v_other, v_other + gap)
-            differ = p_other != p
-            share = (now.late + 0.5) / (decided + 1.0)  # of late commands
-            odds = np.log(np.stack([1.0 - share, share]))[::-1 if self._swapped[k] else 1, differ]
-            chance[differ] = odds[0]
-            parents, p = np.append(parents, parents[differ]), np.append(p, p_other[differ])
-            other, chance = np.append(other, differ[differ]), np.append(chance, odds[1])
-        before = Hypotheses(*(each[parents] for each in now))
-        newest = p - self._run.p[k] - before.moved[:, :-1] @ self._a[1:]
-        late = before.late + ((other != self._swapped[k]) & self._open[k])
-        return before._replace(
-            value=before.value + chance, late=late, p=p,
-            moved=np.column_stack([newest, before.moved[:, :-1]])), parents, other
+    def swapped(self, acting: Acting, places: Sequence[int]) -> Acting:
+        """The same with the other command in these of the open intervals."""
+        v, other, p = acting.v.copy(), acting.other.copy(), acting.p
+        residual, swapped = acting.residual.copy(), acting.swapped.copy()
+        for i in places:
+            k = int(self.at[i])
+            residual[k:k + self._reach] -= self._added(k, v, other, p)
+            v[k], other[k], swapped[i] = other[k], v[k], not swapped[i]
+            p = play(v, self._fit.gap, self._fit.p0)
+        return Acting(v, other, p, residual, swapped)
 
-    def _heard(self, now: Hypotheses, k: int, readings: float) -> Hypotheses:
-        """The hypotheses after y(k); readings: number of those before."""
-        weight, m, taps = self._weights[k], self._fit.m, now.moved[:, :len(self._b)]
-        if not weight:
-            return now
-        by_p, rows = taps @ self._b, np.repeat(self._jacobian[k:k + 1], len(taps), axis=0)
-        rows[:, self._m_at] += by_p
-        rows[:, self._m_at + 3:] += m * taps @ self._of_b.T
-        error = self._run.error[k] - m * by_p - (rows * now.unknowns).sum(axis=1)
-        # Potter's filter: G. J. Bierman, Factorization Methods for Discrete Estimation (1977).
-        seen = np.einsum('hij,hi->hj', now.root, rows)
-        variance = 1.0 / weight + (seen**2).sum(axis=1)
-        gain = (now.root @ seen[:, :, None])[:, :, 0] / variance[:, None]
-        shorter = gain / (1.0 + np.sqrt(1.0 / (weight * variance)))[:, None]
-        more = error**2 / variance
-        density = np.log(variance * now.squares) + (readings + 1.0) * np.log1p(more / now.squares)
-        return now._replace(
-            value=now.value - 0.5 * density, unknowns=now.unknowns + gain * error[:, None],
-            root=now.root - shorter[:, :, None] * seen[:, None, :], squares=now.squares + more)
+    def likeliest(self, acting: Acting, in_pairs: bool) -> list[int]:
+        """The swap, or pair of swaps, that seems to gain most; none if none gains."""
+        v, other, p, _, swapped = acting
+        at, q, reach, gap = self.at, self._q, self._reach, self._fit.gap
+        rest = self._unexplained(acting)
+        swap_to = np.clip(np.append(self._fit.p0, p[:-1])[at], other[at], other[at] + gap)
+        moved, after = swap_to - p[at], np.minimum(at + 1, len(v) - 1)
+        gains = moved * self._along(rest) - 0.5 * moved**2 * self._squares
+        on = np.clip(swap_to, v[after], v[after] + gap) != p[after]  # whether later p change, too
+        for i in np.flatnonzero((moved != 0.0) & on):
+            k = int(at[i])
+            seen = self._added(k, v, other, p)
+            explained = q[k:k + reach].T @ seen
+            gains[i] = seen @ rest[k:k + reach] - 0.5 * (seen @ seen - explained @ explained)
+        fewer, same, more = (self._prior_of(acting, count) for count in (-1, 0, 1))
+        gains = gains / self._noise**2 + np.where(swapped, fewer, more) - same
+        gains[moved == 0.0] = -inf
+        each, by = np.where(on, -inf, gains)[self.newest], moved[self.newest] / self._noise
+        pairs = np.add.outer(each, each) - np.outer(by, by) * self._products
+        np.fill_diagonal(pairs, -inf)
+        if in_pairs and pairs.max(initial=-inf) > max(gains.max(), 0.0):
+            return [*map(int, self.newest[[*divmod(int(pairs.argmax()), len(pairs))]])]
+        return [int(gains.argmax())] if gains.max() > 0.0 else []
+
+    def _moved(self, p: Array) -> Array:
+        """Change of y by this change of p, both (..., N)."""
+        b, a = self._plant
+        return lfilter(b, a, self._fit.m * p)
+
+    def _along(self, values: Array) -> Array:
+        """Sums of values (..., N) times what a unit pulse of p in each interval adds to y."""
+        return self._moved(values[..., ::-1])[..., ::-1][..., self.at]
+
+    def _added(self, k: int, v: Array, other: Array, p: Array) -> Array:
+        """Change of y if the other command acts in interval k."""
+        end = k + self._reach
+        acting = np.append(other[k], v[k + 1:end])
+        moved = play(acting, self._fit.gap, float(p[k - 1]) if k else self._fit.p0) - p[k:end]
+        return self._moved(moved) * self._known[k:end]
+
+    def _unexplained(self, acting: Acting) -> Array:
+        return acting.residual - self._q @ (self._q.T @ acting.residual)
+
+    def _prior_of(self, acting: Acting, more: int = 0) -> float:
+        """Its log-prior with so many more commands swapped."""
+        late = self._settled + int(acting.swapped.sum()) + more
+        return _log_prior(max(late, 0), self._count)
 
 
 def likelier(
@@ -149,12 +142,24 @@ def likelier(
 
     already: samples swapped so far. Returns the record and all samples that are swapped in it.
     """
-    since = max(since, record.end - NEWEST, record.first)
     if not record.between(since).is_open or fit.m <= 0.0:
         return record, already
-    swapped = np.isin(np.arange(record.first, record.end), list(already))
-    decisions = Decisions(setup, record, fit, swapped, older, since - record.first)
-    found = frozenset((record.first + np.flatnonzero(decisions.likeliest())).tolist())
+    intervals = OpenIntervals(setup, record, fit, already, older, since)
+    acting, newest = intervals.start, intervals.newest
+    best = intervals.log_posterior(acting)
+    for _ in range(200):  # at most this many times
+        # A pair may gain less than it seems; one of three commands may have to be taken back first.
+        back = [([i], True) for i in newest[acting.swapped[newest]].tolist()]
+        for taken_back, in_pairs in [([], True), ([], False), *back]:
+            there = intervals.swapped(acting, taken_back)
+            there = intervals.swapped(there, intervals.likeliest(there, in_pairs))
+            if (now := intervals.log_posterior(there)) > best + 1e-6:
+                best, acting = now, there
+                break
+        else:
+            break
+    changed = acting.swapped != intervals.start.swapped
+    found = frozenset((record.first + intervals.at[changed]).tolist())
     return record.swapped(found), already ^ found
 
 
