@@ -161,6 +161,16 @@ def test_what_is_unexplained_does_not_depend_on_the_unit_of_y() -> None:
     assert 1e-3 < found[0] < 0.1
 
 
+def test_a_wrong_sign_is_named_only_where_it_is_certain() -> None:
+    family = PlantFamily(TransferFunction([0.3], [1.0, -0.7]), 0.0)
+    bounds = Bounds((0.1, 10.0), (0.0, 10.0), (-10.0, 0.0))
+    setup = Setup(family, 1e-3, bounds, 20.0, 1.0, 0.0, np.zeros(3))
+    for std, named in ((0.1, True), (0.5, False)):
+        cov = np.diag([std**2, 0.01, 0.01])
+        fit = WindowFit(np.zeros(1), 0.0, np.array([-1.0, 0.1, 1.0]), 1e-3, cov=cov)
+        assert setup.moves_against(fit) is named
+
+
 def test_readings_that_repeat_one_rounding_count_as_one() -> None:
     y, known = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 9.0]), np.arange(6) < 5
     weights, number = independence(y, known, np.full(6, 1.2), 1.0)
