@@ -28,13 +28,7 @@ from backlash_ros.nodes.control.publishing import StepPublisher
 from backlash_ros.nodes.control.rivals import RivalWatch
 from backlash_ros.nodes.runtime.driver_io import DriverIo, check_style
 from backlash_ros.nodes.runtime.executor import PromptExecutor, refuse_unfit_transitions
-from backlash_ros.nodes.runtime.messages import (
-    DEPTH,
-    DIAGNOSTICS_PERIOD_S,
-    KEPT_QOS,
-    arrival_ns,
-    line_of,
-)
+from backlash_ros.nodes.runtime.messages import DEPTH, DIAGNOSTICS_PERIOD_S, KEPT_QOS, line_of
 from backlash_ros.nodes.runtime.process import ProcessNode, emit, run
 
 
@@ -248,22 +242,22 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
         self._io.serve_waiting()
         steps = self.loops.answer(outputs)
         if steps:
-            period_s = self.settings.sample_period
-            if next(iter(outputs.values())).received_ns > self._io.now_ns() - period_s * 1e9:
+            period_s, output = self.settings.sample_period, next(iter(outputs.values()))
+            if output.received_ns > self._io.now_ns() - period_s * 1e9:
                 # Let the driver, which the command wakes up, have a busy processor first.
                 time.sleep(0.05 * period_s)
             self._follow_up(steps)
-            self._look_early(next(iter(outputs.values())).received_ns)
+            self._look_early(output)
 
-    def _look_early(self, heard_ns: int) -> None:
-        """Take waiting references and reports shortly before the next y, heard_ns: after this one.
+    def _look_early(self, newest: Output) -> None:
+        """Take waiting references and reports shortly before the next output is due.
 
         They do not delay it then, and a process that has just been awake answers sooner.
         """
         before_ns, period_ns, executor = 600_000, self.loops.counter.sender.period_ns, self.executor
         # At higher rates there is hardly a pause.
         if period_ns > 5 * before_ns and isinstance(executor, PromptExecutor):
-            due_ns = arrival_ns(heard_ns + self._io.clock.set_ns) + period_ns - before_ns
+            due_ns = self._io.arrival_ns(newest) + period_ns - before_ns
             executor.due = due_ns, self._io.serve_waiting
 
     def _pair(self, which: int, came: int | Mapping[str, float] | Output) -> None:

@@ -70,8 +70,7 @@ class ReferenceNode(ProcessNode):
         def hear(joints: Mapping[str, Output]) -> None:
             output = next(iter(joints.values()))
             if counter.count(output.stamp_ns, output.sequence, output.numbered).is_sample:
-                received_ns = output.received_ns + self._io.clock.set_ns
-                pace.hear(counter.index, messages.arrival_ns(received_ns) * 1e-9)
+                pace.hear(counter.index, self._io.arrival_ns(output) * 1e-9)
 
         outputs = self._io.listen(hear, depth=1, polled=True)
         diagnostics = self.listen_to_diagnostics(self._hear_diagnostics)

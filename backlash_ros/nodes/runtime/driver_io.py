@@ -129,6 +129,10 @@ class DriverIo:
         return self.now_ns() if self.simulated_time \
             else int(info['source_timestamp']) - self.clock.of_stamps_ns
 
+    def arrival_ns(self, output: Output) -> int:
+        """When an output arrived, on the monotonic clock."""
+        return messages.arrival_ns(output.received_ns + self.clock.set_ns)
+
     def known_of(self, timing: Timing) -> Timing:
         # Simulated stamps cannot be compared with the time of arrival.
         age_s = nan if self.simulated_time else timing.age_s

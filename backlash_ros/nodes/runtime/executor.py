@@ -17,6 +17,8 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
 WITH_INFO = Subscription.CallbackType.WithMessageInfo
+Due = tuple[float, Callable[[], object]]  # when [ns, monotonic clock], and what is to be done
+NOTHING_DUE: Due = inf, bool
 
 
 class Polled(MutuallyExclusiveCallbackGroup):
@@ -65,7 +67,7 @@ class PromptExecutor(SingleThreadedExecutor):
     The executor of rclpy builds a wait set of all entities for each message, which takes longer
     than to answer it. This one keeps a wait set of subscriptions, calls timers when they are due,
     and leaves the rest to rclpy five times a second. It wakes up as often, for signals.
-    due: when to wake up once for an action, on the monotonic clock [ns], and the action.
+    due: what to wake up for once.
     """
 
     def __init__(self, node: Node) -> None:
@@ -78,7 +80,7 @@ class PromptExecutor(SingleThreadedExecutor):
         self._served: list[tuple[Any, ...]] = []
         self._wait_set: Any = None
         self._look_at_ns = self._rclpy_at_ns = 0  # when timers are due, and all else
-        self.due: tuple[float, Callable[[], object]] = inf, bool
+        self.due = NOTHING_DUE
 
     def can_execute(self, entity: Any) -> bool:
         return not isinstance(entity, (Subscription, Timer)) and bool(super().can_execute(entity))
@@ -98,7 +100,7 @@ class PromptExecutor(SingleThreadedExecutor):
             self.look_if_due(ahead_ns=12_000_000)
             return
         if time.monotonic_ns() >= self.due[0]:
-            (_, act), self.due = self.due, (inf, bool)
+            (_, act), self.due = self.due, NOTHING_DUE
             act()
         self.look_if_due()
 
