@@ -57,9 +57,8 @@ class HeldUpProcesses:
 
     def __init__(self, p: Parameters, load: float, seed: int, reports: bool) -> None:
         self.period, self._reports = p.sample_period, reports
-        self._load, self._random = load, Random(seed)
-        self._now = self._sent = 0.0  # sent: the newest command
-        self.loop = ControlLoop(p, self._send, Driver(lambda: _ns(self._now)), None,
+        self._load, self._random, self._now = load, Random(seed), 0.0
+        self.loop = ControlLoop(p, Driver(lambda: _ns(self._now)), None,
                                 SampleCounter(self.period, False))
         self._reference = build_reference(p)
         # Of the driver: when it samples next, the number of the sample, and a command on its way.
@@ -121,10 +120,12 @@ class HeldUpProcesses:
         output = Output(y, _ns(left), _ns(left), _ns(self._now), number)
         self.loop.take_reference(self._reference(self._now))
         step = self.loop.answer(output)
+        if step is not None:
+            self.loop.note_answer(step, output)
         self._now += ANSWER_S
         if step is not None:
             arrives = self._now + self._random.uniform(*TRANSPORT_S)
-            self._command = arrives, self._sent
+            self._command = arrives, step.v
             self._driver_at = min(self._driver_at, arrives + self._wait())
         behind = bool(self._outputs) and self._outputs[0][2] < self._now - self.period
         if step is not None and not behind:
@@ -134,9 +135,6 @@ class HeldUpProcesses:
         self._controller_at = max(self._now, self._outputs[0][2]) + self._wait() \
             if self._outputs else inf
         return step is not None
-
-    def _send(self, v: float) -> None:
-        self._sent = v
 
 
 def _ns(seconds: float) -> int:

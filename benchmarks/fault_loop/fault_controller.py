@@ -45,7 +45,7 @@ class Controller:
             lambda: driver.answered_ns - self._clock.set_ns, may_report=lambda: driver.reports,
             steady_s=lambda: driver.tick * self.p.sample_period,
         )
-        self.loop = ControlLoop(self.p, self._send, asked, inherited, self._counter, v)
+        self.loop = ControlLoop(self.p, asked, inherited, self._counter, v)
 
     def cycle(self, clean_up: bool) -> None:
         self.deactivate()
@@ -62,7 +62,7 @@ class Controller:
         loop = self.loop
         if loop.statistics.used and not loop.standing_down:
             loop.end(self.p.on_stop)
-            while loop.send_next():
+            while self._send_next():
                 pass
 
     def take_up(self, p: Parameters) -> None:
@@ -94,12 +94,21 @@ class Controller:
             begins = loop.phase in (Phase.BEGINS, Phase.SILENT)
             step = loop.answer(output)
             if step is not None:
+                self._send(step.v)
+                loop.note_answer(step, output)
                 self.note(step, begins or loop.core is not core)
                 if i + 1 == len(outputs):
                     loop.core.refine()
         if loop.is_overdue:
             loop.give_up()
-        loop.send_next()
+        self._send_next()
+
+    def _send_next(self) -> bool:
+        v = self.loop.next_command()
+        if v is not None:
+            self._send(v)
+            self.loop.note_sent(v)
+        return v is not None
 
     def _send(self, v: float) -> None:
         self.sent(v, self.loop.core.limits)

@@ -1,10 +1,9 @@
-"""From outputs to commands, for all joints: count → learn → control → limit → send → report."""
+"""From outputs to commands, for all joints: count → learn → control → limit → send → note."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields
 from enum import Enum
-from functools import partial
 from itertools import cycle
 from math import isfinite, nan
 from typing import NamedTuple
@@ -71,9 +70,8 @@ class ControlLoop:
     """
 
     def __init__(
-        self, p: Parameters, send: Callable[[float], None], driver: Driver,
-        estimate: Estimate | None, counter: SampleCounter, v: float | None = None,
-        executor: Executor | None = None,
+        self, p: Parameters, driver: Driver, estimate: Estimate | None, counter: SampleCounter,
+        v: float | None = None, executor: Executor | None = None,
     ) -> None:
         self.counter, self.heard, self.phase = counter, Newest(), Phase.BEGINS
         counts = LoopStatistics(still_band=still_band(p))
@@ -83,7 +81,7 @@ class ControlLoop:
         self.knows_v = v is not None
         if v is not None:
             self.core.motion = at_rest(v)
-        self.driver, self._p, self._send = driver, p, send
+        self.driver, self._p = driver, p
         self._gap = NEXT_SAMPLE  # samples missing since the newest output that was used
         self._ending: Iterator[float] = iter(())  # last commands, see `end`
 
@@ -132,33 +130,30 @@ class ControlLoop:
             self.statistics.bad_reports += 1
 
     def answer(self, output: Output, arrival: Arrival | None = None) -> ControlStep | None:
-        """Count y(k), learn from it, and send v(k); return None if no command follows from it.
+        """Count y(k) and learn from it; return the step to v(k), None if no command follows.
 
-        arrival: of an output that has been counted already.
+        The caller sends v(k), then notes it. arrival: of an output that has been counted already.
         """
         if not self._is_usable(output, arrival or self.counter.count(*output.counted)):
             return None
-        step = self._step_core(output.y, self.heard.y_m, output.stamp_ns)
-        self.send(step.v)
+        return self._step_core(output.y, self.heard.y_m, output.stamp_ns)
+
+    def note_answer(self, step: ControlStep, output: Output) -> None:
+        """Note that v(k), the answer to this y(k), has just left."""
+        self.note_sent(step.v)
         took_s = (self.driver.wall_ns() - output.sent_ns) * 1e-9
         self.statistics.note(output.y, step.v, self.core.inverse.limited,
                              step.estimate.status is Status.INCONSISTENT, took_s)
-        return step
+
+    def note_sent(self, v: float) -> None:
+        self.knows_v = True
+        self.commands.publish(v, self.driver.now_ns())
 
     def skip(self, arrival: Arrival) -> None:
         """Note a sample of which this loop has no output."""
         if arrival.is_sample and not self.standing_down:
             self._note_missing(arrival)
             self._note_missing(Arrival(missing=1), lost=False)
-
-    def send(self, v: float) -> None:
-        """Send a command and note when it left; do nothing while another controller commands."""
-        if not self.standing_down:
-            if v != self.v:  # it does not come from the core
-                self.core.motion = Motion(v, v - self.v, v)
-            self.knows_v = True
-            self._send(v)
-            self.commands.publish(v, self.driver.now_ns())
 
     def _is_usable(self, output: Output, arrival: Arrival) -> bool:
         """Count a message of y; return whether it is to be answered with a command."""
@@ -276,15 +271,16 @@ class ControlLoop:
         self.renew(self.estimate)
 
     def end(self, action: str) -> None:
-        """Have send_next send the last commands of an action, see last_commands, if v is known."""
+        """Have next_command yield the last commands of an action, if v is known: last_commands."""
         self._ending = last_commands(action, self.core.motion, lambda: self.core.limits) \
             if self.knows_v else iter(())
 
-    def send_next(self) -> bool:
+    def next_command(self) -> float | None:
+        """The next of the last commands, to be sent and noted; None after the last one."""
         v = next(self._ending, None)
         if v is not None:
-            self.send(v)
-        return v is not None
+            self.core.motion = Motion(v, v - self.v, v)
+        return v
 
     def renew(self, estimate: Estimate | None) -> None:
         """Continue from the present v with a new core, which begins with these estimates if any."""
@@ -337,11 +333,10 @@ class JointLoops:
         executor: Executor | None = None,
     ) -> None:
         self.counter, self._send, self._together = counter, send, p.io.together
-        self._commands: dict[str, float] = {}  # to be sent in the next message
         self.by_name = {
             joint: ControlLoop(
-                p.of_joint(joint), self._sender_of(joint, len(p.joint_names)), driver(joint),
-                before.get(joint), counter, (v or {}).get(joint), executor,
+                p.of_joint(joint), driver(joint), before.get(joint), counter,
+                (v or {}).get(joint), executor,
             ) for joint in p.joint_names
         }
         self.loops = tuple(self.by_name.values())
@@ -365,7 +360,10 @@ class JointLoops:
                 loop.skip(arrival)
             elif (step := loop.answer(outputs[joint], arrival)) is not None:
                 steps[joint] = step
-        self._send_waiting()
+        if steps:
+            self._send({joint: step.v for joint, step in steps.items()})
+            for joint, step in steps.items():
+                self.by_name[joint].note_answer(step, outputs[joint])
         return steps
 
     def prepare(self, joints: Iterable[str]) -> None:
@@ -395,16 +393,11 @@ class JointLoops:
         return ending
 
     def send_next(self) -> bool:
-        sent = [loop.send_next() for loop in self.loops]
-        self._send_waiting()
-        return any(sent)
-
-    def _sender_of(self, joint: str, joints: int) -> Callable[[float], None]:
-        if joints == 1:  # it leaves at once, and is noted afterwards
-            return lambda v: self._send({joint: v})
-        return partial(self._commands.__setitem__, joint)
-
-    def _send_waiting(self) -> None:
-        if self._commands:
-            self._send(dict(self._commands))
-            self._commands.clear()
+        """Send the next of the last commands of each joint; return whether there was any."""
+        commands = {joint: v for joint, loop in self.by_name.items()
+                    if (v := loop.next_command()) is not None}
+        if commands:
+            self._send(commands)
+            for joint, v in commands.items():
+                self.by_name[joint].note_sent(v)
+        return bool(commands)

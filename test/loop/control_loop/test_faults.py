@@ -243,17 +243,19 @@ MOVE = 0.5  # at most, from sample to sample
 
 def first_command(heard_at: int, reported_at: int) -> float:
     """v after another controller commanded 4.0, and the driver reported -4.0, at these samples."""
-    sent: list[float] = []
     now = [0]
     p = Parameters({'control.min': -10.0, 'control.max': 10.0, 'control.rate_max': 100.0 * MOVE})
     loop = ControlLoop(
-        p, sent.append, Driver(lambda: now[0] * PERIOD_NS), None,
-        SampleCounter(0.01, from_zero=False), 0.0)
-    def answer(k: int) -> None:
+        p, Driver(lambda: now[0] * PERIOD_NS), None, SampleCounter(0.01, from_zero=False), 0.0)
+    def answer(k: int) -> float:
         now[0] = k
         stamp_ns = k * PERIOD_NS
         loop.take_reference(0.0)
-        loop.answer(Output(0.0, stamp_ns, stamp_ns, stamp_ns, k))
+        output = Output(0.0, stamp_ns, stamp_ns, stamp_ns, k)
+        step = loop.answer(output)
+        assert step is not None
+        loop.note_answer(step, output)
+        return step.v
     answer(1)
     loop.stand_down()
     for k in range(2, 8):
@@ -263,8 +265,7 @@ def first_command(heard_at: int, reported_at: int) -> float:
         if k == reported_at:
             loop.take_applied(-4.0, k * PERIOD_NS - 1)
     loop.resume()
-    answer(8)
-    return sent[-1]
+    return answer(8)
 
 
 @pytest.mark.parametrize(('heard_at', 'v'), [(7, 4.0), (5, -4.0)])
@@ -278,14 +279,17 @@ def test_reports_are_heard_first_where_a_gap_makes_the_loop_begin_again() -> Non
         Parameters({
             'timeout.plant_output': 0.05, 'control.min': -10.0, 'control.max': 10.0,
             'control.rate_max': 10.0}),
-        lambda v: None, Driver(lambda: stamp_ns), None, SampleCounter(0.01), 0.0)
+        Driver(lambda: stamp_ns), None, SampleCounter(0.01), 0.0)
     loop.take_reference(0.0)
     for k in (1, 2, 3, back):
         stamp_ns = k * PERIOD_NS
         assert abs(loop.v) <= 0.1 * k  # the driver tells of another v in the gap alone
         if k == back:
             loop.take_applied(2.5, stamp_ns - 1000)
-        loop.answer(Output(0.0, stamp_ns, stamp_ns, stamp_ns, k))
+        output = Output(0.0, stamp_ns, stamp_ns, stamp_ns, k)
+        step = loop.answer(output)
+        assert step is not None
+        loop.note_answer(step, output)
     assert loop.statistics.interruptions == 1
     assert abs(loop.v - 2.5) <= 0.1 + 1e-9
 

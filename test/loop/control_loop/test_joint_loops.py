@@ -75,3 +75,20 @@ def test_a_thousand_faults_of_a_joint_change_no_command_of_another_by_a_bit() ->
         assert same == (joint != 'elbow')
     unanswered = sum(map(isnan, beside['elbow']))
     assert unanswered == sum(fault != 3 for fault in faults.values())
+
+
+def test_commands_are_noted_once_the_message_of_all_joints_has_left() -> None:
+    now_ns = 1_000_000_000
+    def send(commands: Mapping[str, float]) -> None:
+        nonlocal now_ns
+        assert not any(loop.knows_v for loop in loops.loops)
+        now_ns += 2_000_000  # what it takes to publish
+    loops = JointLoops(parameters(), send, lambda joint: Driver(
+        lambda: now_ns, wall_ns=lambda: now_ns), {}, SampleCounter(PERIOD))
+    loops.take_references(dict.fromkeys(JOINTS, 0.1))
+    output = Output(0.0, now_ns, now_ns, now_ns, 1, False)
+    assert set(loops.answer(dict.fromkeys(JOINTS, output))) == set(JOINTS)
+    for loop in loops.loops:
+        assert loop.knows_v
+        assert loop.commands.newest_ns == now_ns
+        assert list(loop.statistics.latencies) == [0.002]

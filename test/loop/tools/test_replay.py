@@ -141,7 +141,7 @@ class LimitingDriver:
     def run(self) -> RunRecord:
         p, now_ns = self._p, START_NS
         plant, reference = build_plant(p), build_reference(p)
-        loop = ControlLoop(p, lambda v: None, Driver(lambda: now_ns), None, SampleCounter(0.01))
+        loop = ControlLoop(p, Driver(lambda: now_ns), None, SampleCounter(0.01))
         applied = 0.0
         for k in range(SAMPLES):
             sampled_ns = START_NS + k * PERIOD_NS
@@ -162,6 +162,8 @@ class LimitingDriver:
     def _answer(self, loop: ControlLoop, output: Output, y_m: float) -> None:
         loop.take_reference(y_m)
         step = loop.answer(output)
+        assert step is not None
+        loop.note_answer(step, output)
         loop.core.refine()
         self._rows.append(row_of(0.01 * loop.counter.index, step.y, step.v, np.nan, step,
                                  loop.core.estimator))

@@ -121,7 +121,7 @@ def test_whoever_builds_a_controller_begins_with_what_was_known(file: Path) -> N
     run = build_closed_loop(p).run(30)
     assert run.column('c_l')[0] == LEARNED.c_l
     assert replay(run, p).column('c_l')[0] == LEARNED.c_l
-    loop = ControlLoop(p, lambda v: None, Driver(lambda: 0), None, SampleCounter(0.01))
+    loop = ControlLoop(p, Driver(lambda: 0), None, SampleCounter(0.01))
     assert loop.estimate.m == LEARNED.m
     loop.reset()
     assert loop.estimate.m == p.estimator.initial.m

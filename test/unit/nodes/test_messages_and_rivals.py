@@ -109,10 +109,12 @@ def test_sections_that_do_not_reach_their_node_are_named(sections, full_name, re
 
 def test_a_sample_has_a_value_of_every_label_and_bands_of_two_deviations() -> None:
     counter = SampleCounter(Parameters().sample_period)
-    loop = ControlLoop(Parameters(), lambda v: None, Driver(lambda: 0), None, counter)
+    loop = ControlLoop(Parameters(), Driver(lambda: 0), None, counter)
     loop.take_reference(1.0)
-    made = loop.answer(Output(0.5, 0, 0, 0, 0))
+    output = Output(0.5, 0, 0, 0, 0)
+    made = loop.answer(output)
     assert made is not None
+    loop.note_answer(made, output)
     e = Estimate(1.3, 3.0, -2.0, 0.2, 0.05, 0.1, 0.3, Status.TRACKING)
     values = labelled(loop, made._replace(estimate=e))
     assert {*topics.SIGNAL_LABELS, *topics.ESTIMATE_LABELS, *topics.WATCH_LABELS} == set(values)
