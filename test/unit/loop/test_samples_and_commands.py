@@ -212,6 +212,17 @@ def test_repetitions_and_floods_are_no_samples(shares: list[float]) -> None:
     assert counter.index == 59
 
 
+@given(st.integers(1, 40), st.integers(0, 40), st.integers(0, 40))
+def test_a_repetition_that_is_lost_is_no_missing_sample(lost, repeated, before) -> None:
+    counter, due = paced_counter()
+    assert not counter.count(due - PERIOD_NS // 2, 41).is_sample
+    for k in range(before):
+        assert counter.count(due + k * PERIOD_NS, 42 + k) == Arrival()
+    number = 42 + before + lost + repeated
+    there = counter.count(due + (before + lost) * PERIOD_NS, number)
+    assert (there.missing, counter.index) == (lost, 40 + before + lost)
+
+
 @given(st.integers(1, 10**6), st.floats(0.0, 1.0))
 def test_second_sender_is_refused_while_the_first_one_sends(first: int, phase: float) -> None:
     counter, due = paced_counter()
