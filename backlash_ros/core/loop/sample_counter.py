@@ -16,7 +16,7 @@ UNNUMBERED = 2**64 - 1
 # Jitter of the sender up to this fraction of a period is not taken for a loss.
 JITTER = 0.85
 # Samples for which numbers do not count samples, after one that was given to a repeated message.
-DOUBT = 50
+DISBELIEVED = 50
 CLOCK_SLACK = 0.01  # fraction of a period by which the sender's clock may run slow per sample
 
 
@@ -267,7 +267,7 @@ class SampleCounter:
                 skipped = by_time
         if keeps_time and is_early:
             if skipped == 0:
-                self._repeated, self._doubt = sequence, DOUBT
+                self._repeated, self._doubt = sequence, DISBELIEVED
             return NO_SAMPLE
         missing = max(by_time, skipped) if numbered else by_time
         if missing == 0 and not keeps_time:
