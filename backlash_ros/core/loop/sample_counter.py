@@ -15,8 +15,9 @@ UNNUMBERED = 2**64 - 1
 # A stamp is never earlier than its sample, so a missing sample shows as a full period of lateness.
 # Jitter of the sender up to this fraction of a period is not taken for a loss.
 JITTER = 0.85
-# Samples for which numbers do not count samples, after one that was given to a repeated message.
-DISBELIEVED = 50
+# For so many samples after a message that repeats y under a number of its own, numbers may count
+# such messages as well.
+MISNUMBERED = 50
 CLOCK_SLACK = 0.01  # fraction of a period by which the sender's clock may run slow per sample
 
 
@@ -218,7 +219,7 @@ class SampleCounter:
         self._from_zero = from_zero
         self._stamp_ns = self._sequence = 0  # of the newest sample
         self._repeated = 0  # number of the newest message that came too early to be a sample
-        self._doubt = 0  # samples for which numbers are not believed
+        self._misnumbered = 0  # samples for which numbers are not believed any more than time
         self._early_ns = 0.0  # the earliest time at which the newest sample may have been due
         self._lateness_ns: deque[float] = deque(maxlen=20)  # of the newest samples, unshifted
         self._shifted_ns = 0.0  # by how much due_ns was shifted so far
@@ -256,7 +257,7 @@ class SampleCounter:
                 return self._of_another(stamp_ns, sequence, by_time, silent and not keeps_time)
             if not numbered and is_early and skipped > 0:
                 return NO_SAMPLE  # of another sender
-            if self._doubt and keeps_time:  # some of the missing ones were no samples, either
+            if self._misnumbered and keeps_time:
                 skipped = min(skipped, by_time)
             # Numbers may jump some samples further than time has passed.
             if numbered and keeps_time and skipped > late + 4.0:
@@ -267,7 +268,7 @@ class SampleCounter:
                 skipped = by_time
         if keeps_time and is_early:
             if skipped == 0:
-                self._repeated, self._doubt = sequence, DISBELIEVED
+                self._repeated, self._misnumbered = sequence, MISNUMBERED
             return NO_SAMPLE
         missing = max(by_time, skipped) if numbered else by_time
         if missing == 0 and not keeps_time:
@@ -280,7 +281,8 @@ class SampleCounter:
                 self._on_time = 20
                 return arrival
         self._sequence = self._repeated = sequence
-        self._stamp_ns, self._strange, self._doubt = stamp_ns, 0, max(self._doubt - 1, 0)
+        self._stamp_ns, self._strange = stamp_ns, 0
+        self._misnumbered = max(self._misnumbered - 1, 0)
         self._follow_phase(stamp_ns, missing, 20 if self._on_time >= 20 else 6)
         self.sender.follow(stamp_ns)
         self.index += 1 + missing
