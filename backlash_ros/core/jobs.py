@@ -15,10 +15,11 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from importlib import import_module
-from pathlib import Path
 from queue import SimpleQueue
 from threading import Event, Thread
 from typing import IO, Any, NamedTuple
+
+from backlash_ros.core.priority import compute_beside
 
 Job = Callable[..., Any]
 Message = Sequence[bytes | bytearray | memoryview]  # a pickled object, and the arrays in it
@@ -175,12 +176,7 @@ def _start(preload: tuple[str, ...], loops: int) -> subprocess.Popen[bytes]:
         # A second thread for linear algebra would occupy the core on which the loop runs.
         env={**os.environ, 'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'},
     )
-    # Set from here, to hold during its imports as well: it inherits a real-time loop's policy.
-    os.sched_setscheduler(process.pid, os.SCHED_OTHER, os.sched_param(0))
-    niceness = os.getpriority(os.PRIO_PROCESS, 0) + 5
-    os.setpriority(os.PRIO_PROCESS, process.pid, niceness)
-    with suppress(OSError):  # kernel without autogroup scheduling
-        Path(f'/proc/{process.pid}/autogroup').write_text(str(niceness))
+    compute_beside(process.pid)  # from here, to hold during its imports as well
     return process
 
 

@@ -23,6 +23,7 @@ from backlash_ros.core.loop.control_loop import JointLoops
 from backlash_ros.core.loop.diagnosis import Neighbours
 from backlash_ros.core.loop.sample_counter import Output, SampleCounter, Timing
 from backlash_ros.core.parameters import CONTROLLER, ParameterError, Parameters
+from backlash_ros.core.priority import answer_first
 from backlash_ros.nodes.control.joint import Joint, offer_services
 from backlash_ros.nodes.control.publishing import StepPublisher
 from backlash_ros.nodes.control.rivals import RivalWatch
@@ -43,6 +44,7 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
     reconfigurable = True
 
     def __init__(self) -> None:
+        answer_first()
         ProcessNode.__init__(self, CONTROLLER)
         LifecycleNodeMixin.__init__(self)
         refuse_unfit_transitions(self)

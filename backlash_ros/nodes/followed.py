@@ -1,12 +1,10 @@
 """Follow running controllers, found by what they publish: their state and newest messages."""
 
-import os
 import re
 import time
 from argparse import RawDescriptionHelpFormatter
 from collections import deque
 from collections.abc import Sequence
-from contextlib import suppress
 from functools import partial
 from math import inf, nan
 from typing import Any
@@ -15,6 +13,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.subscription import Subscription
 from std_msgs.msg import Float64
 
+from backlash_ros.core.priority import give_way
 from backlash_ros.nodes.runtime.executor import serve_polled
 from backlash_ros.nodes.runtime.messages import SILENT_S
 from backlash_ros.nodes.runtime.process import ProcessNode
@@ -145,12 +144,3 @@ def viewer_options(name: str, description: str | None, epilog: str) -> OptionPar
     parser.add_argument('name', nargs='*', metavar='NAME',
                         help='a controller or a namespace, as /pan (default: all there are)')
     return parser
-
-
-def give_way() -> None:
-    """Lower the priority below that of the loop. Call it first, as threads inherit it."""
-    os.nice(10)
-    # Niceness counts only among the processes of one session, see autogroup in sched(7). A process
-    # of this class that wakes up interrupts none that runs, of whatever session.
-    with suppress(OSError):  # some containers do not allow it
-        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))

@@ -1,9 +1,12 @@
 """Worker processes: what they compute, what their death costs; runs on a Dask cluster."""
 
+import ctypes
 import math
 import operator
 import os
+import platform
 import signal
+import struct
 import subprocess
 import sys
 import time
@@ -19,16 +22,20 @@ from waiting import DEADLINE_S, wait_until
 from worker_jobs import checksum, foreign_modules, last_for_ever
 
 from backlash_ros.core.jobs import LOST, Channel, Failure, WorkerExecutor
+from backlash_ros.core.priority import TURN_NS
 from backlash_ros.tools.bringup.supervisor import with_source
 from backlash_ros.tools.simulate import main
 
 KILLED = 3  # times
+SCHED_GETATTR = {'x86_64': 315, 'aarch64': 275}.get(platform.machine(), -1)  # system call
 PARENT = f"""
 import sys, time
 sys.path[:0] = [{str(ROOT)!r}, {str(ROOT / 'test')!r}]
 from pathlib import Path
 from backlash_ros.core.jobs import WorkerExecutor
+from backlash_ros.core.priority import answer_first
 from worker_jobs import last_for_ever
+answer_first()
 executor = WorkerExecutor()
 channel = executor.open()
 channel.submit(last_for_ever, Path(sys.argv[1]))
@@ -125,13 +132,15 @@ def test_a_worker_that_is_killed_costs_nothing_but_the_job_under_way(executor, t
         assert executor.worker is not None
 
 
+def parent_of_a_worker(begun: Path) -> subprocess.Popen[str]:
+    return subprocess.Popen([sys.executable, '-c', PARENT, str(begun)], stdout=subprocess.PIPE,
+                            stderr=subprocess.PIPE, text=True)
+
+
 @pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGINT])
 def test_a_worker_ends_with_its_parent_though_it_works(tmp_path: Path, number: int) -> None:
     begun = tmp_path / 'begun'
-    with subprocess.Popen(
-        [sys.executable, '-c', PARENT, str(begun)], stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE, text=True,
-    ) as parent:
+    with parent_of_a_worker(begun) as parent:
         try:
             worker = int(parent.stdout.readline())
             wait_until(begun.exists, 'the job is under way')
@@ -140,6 +149,27 @@ def test_a_worker_ends_with_its_parent_though_it_works(tmp_path: Path, number: i
             parent.send_signal(number)
         wait_until(lambda: not is_there(worker), 'the worker has ended')
         assert parent.stderr.read().count('Traceback') == (number == signal.SIGINT)
+
+
+def turn_of(pid: int) -> int:
+    """Length of the turns of a process [ns], 0 if the kernel does not tell."""
+    attributes = ctypes.create_string_buffer(48)
+    ctypes.CDLL(None).syscall(SCHED_GETATTR, pid, attributes, len(attributes), 0)
+    return int(struct.unpack('=IIQiIQQQ', attributes.raw)[5])
+
+
+def test_a_loop_is_served_before_its_worker(tmp_path: Path) -> None:
+    with parent_of_a_worker(tmp_path / 'begun') as parent:
+        try:
+            worker = psutil.Process(int(parent.stdout.readline()))
+            loop = psutil.Process(parent.pid)
+            assert (loop.nice(), worker.nice()) == (os.nice(0), os.nice(0) + 5)
+            if not turn_of(os.getpid()):
+                pytest.skip('turns are all alike: Linux is older than 6.12')
+            assert {turn_of(thread.id) for thread in loop.threads()} == {TURN_NS}
+            assert turn_of(worker.pid) > TURN_NS or os.cpu_count() == 1
+        finally:
+            parent.kill()
 
 
 RUNS = ['--duration', '1', '--set', 'output_noise_std=1e-3', '--seeds', '6']

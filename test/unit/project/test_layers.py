@@ -17,8 +17,8 @@ SHARED = {
 LAYERS = ('core', 'bags', 'nodes', 'tools')
 # Each room of the core imports from those before it only; likewise the parts of estimation.
 ROOMS = (
-    'jobs', 'parameters', 'plant', 'window', 'estimate', 'law', 'laws', 'estimation', 'control',
-    'scenario', 'assembly', 'loop', 'records', 'simulation', 'record_fit',
+    'priority', 'jobs', 'parameters', 'plant', 'window', 'estimate', 'law', 'laws', 'estimation',
+    'control', 'scenario', 'assembly', 'loop', 'records', 'simulation', 'record_fit',
     'judgement', 'identification', 'driver_check',
 )
 ESTIMATION = (
