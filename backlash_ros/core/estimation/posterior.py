@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from backlash_ros.core.estimation.settings import BY_CHANCE, CHANCE
+from backlash_ros.core.estimation.settings import CHANCE
 from backlash_ros.core.plant.numerics import chi_square, squares_of
 from backlash_ros.core.plant.transfer_function import Array
 
@@ -137,11 +137,6 @@ class WindowFit:
         return replace(self, step=0.0, noise_std=self.noise)
 
     @property
-    def allowed(self) -> bool:
-        """Whether its G lies within what the prior allows, whatever s is."""
-        return float(np.abs(self.theta[3:]).max(initial=0.0)) < BY_CHANCE * float(SCALES[-1])
-
-    @property
     def valid(self) -> bool:
         """Whether the slope is positive and the covariance finite."""
         return self.m > 0.0 and self.cov.size > 0 and bool(np.isfinite(self.cov).all())
@@ -158,7 +153,7 @@ def agree(one: Array, other: Array, cov: Array) -> bool:
 
 
 def error_of_plant(
-    f: WindowFit, r: Array, squares: float, freedom: float,
+    f: WindowFit, r: Array, squares: float, freedom: float, most_scale: float,
 ) -> tuple[Array, Array, float, float, float]:
     """Posterior of xi, over a grid of s: mean, covariance, most probable s, its share of `volume`,
     and noise variance over that of f. r: triangle of xi, (K + 1, K + 1); squares: of residuals."""
@@ -166,7 +161,7 @@ def error_of_plant(
     if not k:
         return np.zeros(0), np.zeros((0, 0)), f.scale, 0.0, variance
     u, singular, vt = np.linalg.svd(r[:k, :k])
-    z, scales = u.T @ r[:k, k], SCALES[:, None]
+    z, scales = u.T @ r[:k, k], SCALES[most_scale >= SCALES][:, None]
     noise, told, power = np.full((len(scales), 1), variance), (scales * singular) ** 2, z**2
     for _ in range(1 if f.step else 4):  # noise and shrinkage depend on each other
         shrink = 1.0 / (1.0 + told / noise)

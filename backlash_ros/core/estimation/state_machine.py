@@ -19,12 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Status
-from backlash_ros.core.estimation import settings
+from backlash_ros.core.estimation import posterior, settings
 from backlash_ros.core.estimation.belief import Belief, Known, State, Trial, shortened
 from backlash_ros.core.estimation.explanations import Setup, afresh, mixed
 from backlash_ros.core.estimation.fit import FEW_STEPS, Problem
 from backlash_ros.core.estimation.late_commands import likelier, weighed
-from backlash_ros.core.estimation.posterior import Prior, WindowFit, agree, gap_variance
+from backlash_ros.core.estimation.posterior import Prior, WindowFit, agree
 from backlash_ros.core.estimation.settings import BLOCKS, FEWEST, MISFIT, PREDICTED, SHORT_RECORD
 from backlash_ros.core.estimation.unmodelled import as_known, coasts, with_walk
 from backlash_ros.core.plant.numerics import chi_square, isolated, log_density, squares_of
@@ -288,8 +288,7 @@ def _published(setup: Setup, belief: Belief, fit: WindowFit) -> Belief:
         return _beside_inherited(setup, belief, fit, known)
     if not setup.is_known(fit, settings.REVERSALS if belief.kept.older is not None else None):
         # Newer samples may show that less is known than it seemed: that is no contradiction.
-        wrong = not (fit.valid and fit.allowed) or setup.moves_unexplained(fit) \
-            or setup.outside_bounds(fit)
+        wrong = not fit.valid or setup.moves_unexplained(fit) or setup.outside_bounds(fit)
         return belief._replace(reason=Status.INCONSISTENT if wrong else Status.ACQUIRING)
     if belief.trial.predicted < belief.trial.must:
         return belief
@@ -313,8 +312,10 @@ def _beside_inherited(setup: Setup, belief: Belief, fit: WindowFit, known: Known
     if not agree(fit.crossings, known.crossings, alike):
         # A gear that is not pure play leaves systematic residuals, or takes G beyond all that its
         # prior allows, which refutes nothing.
-        sure = not fit.systematic and fit.allowed and fit.left.turns >= settings.HELD_REVERSALS \
-            and gap_variance(cov) < (replacing * fit.gap) ** 2
+        white = not fit.systematic and \
+            max(map(abs, fit.xi), default=0.0) < settings.BY_CHANCE * posterior.SCALES[-1]
+        sure = white and fit.left.turns >= settings.HELD_REVERSALS and \
+            posterior.gap_variance(cov) < (replacing * fit.gap) ** 2
         if sure and belief.trial.predicted >= belief.trial.must:
             belief = belief._replace(inherited=None)  # it belonged to another plant
         return belief._replace(reason=Status.INCONSISTENT)

@@ -9,7 +9,7 @@ over the lags for which it lasts. No variance is less than that for white noise.
 """
 
 from collections.abc import Iterable
-from math import inf, sqrt
+from math import sqrt
 
 import numpy as np
 
@@ -29,7 +29,7 @@ def autocorrelation(residual: Array, lags: int) -> Array:
 
 def covariance_of(problem: Problem, f: WindowFit) -> Array:
     """Covariance of theta, shape (3 + K, 3 + K), that allows for correlated residuals."""
-    columns, count = problem.rows(f, inf, held=False, begun=False)[:, :-1], len(problem.v)
+    columns, count = problem.rows(f)[:, :-1], len(problem.v)
     run = problem.at(f)
     _, score, information = run.likelihood
     residual = np.where(problem.known, score * np.sqrt(run.weights / information), np.nan)

@@ -1,7 +1,5 @@
 """Parts of the fit on their own: the family of G(z; xi), readings, the search, the observer."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from records import moves_with_rests, resonance
@@ -191,38 +189,6 @@ def test_which_delay_is_likelier_does_not_depend_on_the_unit_of_y() -> None:
         return one - other
 
     assert ahead(1e-4) == pytest.approx(ahead(1e3), abs=0.05)
-
-
-def far_g(noise: float) -> tuple[Setup, Window]:
-    """A setup, and a record of a G twice as fast as the nominal one: 3.5 prior deviations."""
-    rng = np.random.default_rng(4)
-    v = np.cumsum(rng.normal(0.0, 0.4, 400))
-    family = PlantFamily(two_poles(0.1), 0.2)
-    y = lfilter(*family.at([0.0, 0.0, np.log(2.0) / 0.2, 0.0]), 1.5 * (play(v, 1.0, v[0]) - 0.3))
-    setup = Setup(family, noise, Parameters().estimator.bounds, 20.0, 2.0, 0.0, np.zeros(3))
-    y += noise * rng.standard_normal(len(v))
-    return setup, Window(0, v, y, np.full(len(v), np.nan))
-
-
-def test_a_fit_that_begins_at_its_optimum_ends_there() -> None:
-    setup, record = far_g(1e-3)
-    problem, best = setup.problem(record), afresh(setup, record)
-    assert best is not None
-    assert best.xi[2] == pytest.approx(np.log(2.0) / 0.2, abs=0.05)
-    again = problem.finished(problem.fitted(best))
-    assert again.theta == pytest.approx(best.theta, rel=1e-3, abs=1e-3)
-    assert again.scale == best.scale > 1.0
-    assert again.evidence == pytest.approx(best.evidence, abs=0.1)
-
-
-def test_a_g_beyond_what_its_prior_allows_explains_nothing() -> None:
-    setup, record = far_g(1e-3)
-    found = afresh(setup, record)
-    assert found is not None
-    assert setup.is_known(found)
-    for xi, allowed in ((29.0, True), (-31.0, False)):
-        theta = np.append(found.theta[:-1], xi)
-        assert setup.is_known(replace(found, theta=theta)) is allowed
 
 
 def test_readings_that_repeat_one_rounding_count_as_one() -> None:
