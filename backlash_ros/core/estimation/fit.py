@@ -151,11 +151,11 @@ class Problem:
         xi, cov_xi, scale, volume, noise = posterior.error_of_plant(
             f, r[n:, n:], squares, freedom, most_scale)
         beta = of_eta @ r[:n, -1] + of_xi @ xi
-        swing, first, p0 = float(np.ptp(self.v)), float(self.v[0]), float(beta[at - 1])
+        swing, first = float(np.ptp(self.v)), float(self.v[0])
         # With a gap of exactly 0, both sides would be engaged at once.
         beta[at + 2] = gap = min(max(beta[at + 2], 1e-9 * swing), 2.0 * swing)
+        p0 = float(beta[at - 1])
         cov = noise * of_eta @ of_eta.T + of_xi @ cov_xi @ of_xi.T
-        volume -= order * log(self.step_of_readings or self.nominal)  # a longer delay, a longer X
         volume -= float(np.log(np.maximum(diagonal, 1e-300)).sum())
         _, knots, knot_std = self._walk_of(f)
         return replace(f, x=beta[:order], knots=beta[order:at - 1], theta=beta[at:],

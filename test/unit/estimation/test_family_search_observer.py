@@ -171,26 +171,6 @@ def test_a_wrong_sign_is_named_only_where_it_is_certain() -> None:
         assert setup.moves_against(fit) is named
 
 
-def test_which_delay_is_likelier_does_not_depend_on_the_unit_of_y() -> None:
-    rng = np.random.default_rng(1)
-    v = np.cumsum(rng.normal(0.0, 0.3, 200))
-    prompt, late = (
-        TransferFunction([0.2, 0.1], [1.0, -1.2, 0.36, *delay]) for delay in ([], [0.0, 0.0]))
-    p = play(v, 0.5, v[0])
-    y = lfilter(prompt.numerator, prompt.denominator, 2.0 * (p - 0.2)) + rng.normal(0.0, 0.5, 200)
-
-    def ahead(unit: float) -> float:
-        """Log-evidence by which the prompt G is likelier."""
-        theta = np.array([2.0 * unit, 0.4 * unit, 0.5])
-        begin = WindowFit(np.zeros(1), float(v[0]), theta, 0.5 * unit)
-        problems = (Problem(PlantFamily(model, 0.0), v, unit * y, 0.5 * unit, step=0.0)
-                    for model in (prompt, late))
-        one, other = (problem.finished(problem.fitted(begin)).evidence for problem in problems)
-        return one - other
-
-    assert ahead(1e-4) == pytest.approx(ahead(1e3), abs=0.05)
-
-
 def test_readings_that_repeat_one_rounding_count_as_one() -> None:
     y, known = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 9.0]), np.arange(6) < 5
     weights, number = independence(y, known, np.full(6, 1.2), 1.0)
