@@ -15,8 +15,8 @@ UNNUMBERED = 2**64 - 1
 # A stamp is never earlier than its sample, so a missing sample shows as a full period of lateness.
 # Jitter of the sender up to this fraction of a period is not taken for a loss.
 JITTER = 0.85
-# For so many samples after a message that repeats y under a number of its own, numbers may count
-# such messages as well.
+# For so many samples after a message that repeats y under a number of its own, numbers do not count
+# samples: as many of them may be those of further repetitions.
 MISNUMBERED = 50
 CLOCK_SLACK = 0.01  # fraction of a period by which the sender's clock may run slow per sample
 
@@ -208,9 +208,10 @@ class SampleCounter:
     """Counts samples both by message number and by stamp, and believes the larger count.
 
     Stamps also show samples that were never published, or lost by a relay that renumbers; a sender
-    that keeps no time is counted by number alone unless it is late. index: of the newest sample, -1
-    before any. due_ns: when that was due. from_zero: whether the first index is the number of its
-    message less 1, or 0; else it is its time in periods, so that a restart reuses no index.
+    that keeps no time is counted by number alone unless it is late, one that has numbered a
+    repetition by stamp alone for a while. index: of the newest sample, -1 before any. due_ns: when
+    that was due. from_zero: whether the first index is the number of its message less 1, or 0; else
+    it is its time in periods, so that a restart reuses no index.
     """
 
     def __init__(self, sample_period_s: float, from_zero: bool = True) -> None:
@@ -257,10 +258,9 @@ class SampleCounter:
                 return self._of_another(stamp_ns, sequence, by_time, silent and not keeps_time)
             if not numbered and is_early and skipped > 0:
                 return NO_SAMPLE  # of another sender
-            if self._misnumbered and keeps_time:
-                skipped = min(skipped, by_time)
             # Numbers may jump some samples further than time has passed.
-            if numbered and keeps_time and skipped > late + 4.0:
+            further = MISNUMBERED if self._misnumbered else 4.0
+            if numbered and keeps_time and skipped > late + further:
                 # A second sender, or a flood of which the middleware has dropped a part: wait a
                 # while for a message that fits.
                 if late < 1.5:
@@ -270,7 +270,8 @@ class SampleCounter:
             if skipped == 0:
                 self._repeated, self._misnumbered = sequence, MISNUMBERED
             return NO_SAMPLE
-        missing = max(by_time, skipped) if numbered else by_time
+        counts_samples = numbered and not (self._misnumbered and keeps_time)
+        missing = max(by_time, skipped) if counts_samples else by_time
         if missing == 0 and not keeps_time:
             # An early one cancels two that were on time.
             self._on_time = max(self._on_time + (-2 if is_early else 1), 0)
