@@ -45,9 +45,9 @@ from threading import Event
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Float64
 rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-stopping = Event()
+stopping, blown = Event(), Event()
 signal.signal(signal.SIGINT, lambda *_: stopping.set())
-signal.signal(signal.SIGUSR1, lambda number, frame: sys.exit('the fuse has blown'))
+signal.signal(signal.SIGUSR1, lambda *_: blown.set())  # an exception could be lost in rclpy
 node = rclpy.create_node('driver')
 output = node.create_publisher(Float64, 'plant_output', 10)
 state = {'v': 0.0, 'y': 0.0}
@@ -58,6 +58,8 @@ def tick():
 node.create_timer(0.01, tick)
 while not stopping.is_set():
     rclpy.spin_once(node, timeout_sec=0.1)
+    if blown.is_set():
+        sys.exit('the fuse has blown')
 print('last command', state['v'], flush=True)
 """
 
