@@ -105,8 +105,7 @@ def afresh(
     hopeless = record.turns(0.01 * swing, first) < setup.turns_needed
     fits, candidates = list[WindowFit](), 1 if hopeless else 3  # number of gaps to fit
     if also is not None and also.m > 0.0:
-        begin = replace(also.without_intervals, knots=np.zeros(0), walk_std=setup.walk_std,
-                        spread=np.zeros(()))
+        begin = also.without_intervals(setup.walk_std)
         # The second one leaves the optimum that `also` is in.
         fits += [p.finished(p.fitted(f, FIRST_STEPS))
                  for f in (p.begun(begin), replace(begin, x=np.zeros(1)))]
@@ -152,7 +151,14 @@ def afresh(
 
 
 def mixed(p: Problem, best: WindowFit, others: Sequence[WindowFit] = ()) -> WindowFit:
-    """The likeliest of these fits and of others nearby, with the spread of the mixture."""
+    """The likeliest of these fits and of others nearby, with the spread of the mixture.
+
+    If its G is incredible: the fit with G as told, if that leaves no more than friction and
+    compliance do, which xi then makes up for; else that fit adds to the spread.
+    """
+    told = best if best.credible else p.as_told(best)
+    if told is not best and told.valid and told.unexplained < settings.NEGLIGIBLE:
+        return mixed(p, told)
     wider, beyond = _along_the_gap(p, best)
     # Only between fits that take readings in the same way can evidences be compared.
     alike_read = (f if bool(f.step) == bool(best.step) else p.finished(p.fitted(replace(
@@ -168,7 +174,7 @@ def mixed(p: Problem, best: WindowFit, others: Sequence[WindowFit] = ()) -> Wind
     share = np.exp(odds - odds.max(initial=-inf))
     for each, f in zip(share / share.sum(), fits, strict=True):
         wider += each * apart(f, best)
-    return replace(best, spread=wider)
+    return replace(best, spread=wider + apart(told, best))
 
 
 def apart(one: WindowFit, other: WindowFit) -> Array:

@@ -326,6 +326,11 @@ class Problem:
             theta[1], knots = theta[1] + best[-1], knots + best[n:-1]
         return replace(f, x=best[:n], knots=knots, theta=theta)
 
+    def as_told(self, f: WindowFit) -> WindowFit:
+        """A finished fit from there, with G as told."""
+        begin = replace(f.without_intervals(0.0), theta=np.append(f.theta[:3], 0.0 * f.theta[3:]))
+        return self.finished(self.fitted(self.begun(replace(begin, told=True), offset=True)))
+
     def with_intervals(self, f: WindowFit) -> WindowFit:
         """The finished fit, by the interval likelihood unless noise hides the quantization."""
         # noise_std is the likeliest of a grid, but large enough that there is a reading near an
@@ -334,7 +339,7 @@ class Problem:
         largest = 0.25 * step
         edges = unknowns / max(float(self.at(f).weights.sum()), 1.0)
         least = min(step * max(1.0 / 64.0, edges), largest)
-        if not step or f.m <= 0.0 or (not f.step and f.noise_std > 0.75 * step):
+        if not step or f.told or f.m <= 0.0 or (not f.step and f.noise_std > 0.75 * step):
             return self.finished(f)
 
         def at(level: float, begin: WindowFit) -> WindowFit:
@@ -352,4 +357,4 @@ class Problem:
                 best = other
         if best.left.rms < 1.5 * max(f.noise, step / sqrt(12.0)):
             return best
-        return self.finished(self.fitted(f.without_intervals))
+        return self.finished(self.fitted(f.without_intervals(f.walk_std)))

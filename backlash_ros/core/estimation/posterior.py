@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from math import inf, nan, sqrt
+from math import exp, inf, nan, sqrt
 from typing import NamedTuple
 
 import numpy as np
 
-from backlash_ros.core.estimation.settings import CHANCE
-from backlash_ros.core.plant.numerics import chi_square, squares_of
+from backlash_ros.core.estimation.settings import BY_CHANCE, CHANCE
+from backlash_ros.core.plant.numerics import agree
 from backlash_ros.core.plant.transfer_function import Array
 
 SCALES = np.asarray(np.geomspace(3e-4, 10.0, 14), np.float64)  # grid of s
@@ -48,6 +48,7 @@ class WindowFit:
     walk_std: float = 0.0  # of u per square root of a sample, 0: no walk
     step: float = 0.0  # quantization step if readings are taken as intervals, else 0
     scale: float = 1.0  # most probable s
+    told: bool = False  # whether G is taken as told, with xi = 0
     cov: Array = field(default_factory=lambda: np.zeros((0, 0)))  # of theta, if residuals are white
     volume: float = 0.0  # log volume of the posterior (Occam factor)
     spread: Array = field(default_factory=lambda: np.zeros(()))  # of m, c_r, c_l, xi by other gaps
@@ -108,7 +109,8 @@ class WindowFit:
 
     def alike(self, other: WindowFit) -> bool:
         """Whether the backlashes of two fits differ by no more than chance."""
-        return agree(self.crossings, other.crossings, self.crossings_cov + other.crossings_cov)
+        cov = self.crossings_cov + other.crossings_cov
+        return agree(self.crossings, other.crossings, cov, CHANCE)
 
     @property
     def gap_std(self) -> float:
@@ -132,9 +134,14 @@ class WindowFit:
         return self.left.readings * self.left.correlation > 1.0 and self.left.rms > rounding
 
     @property
-    def without_intervals(self) -> WindowFit:
-        """The same values for readings that are normal, with quantization as part of the noise."""
-        return replace(self, step=0.0, noise_std=self.noise)
+    def credible(self) -> bool:
+        """Whether G need not be more wrong than its prior allows, by which ln s is 0 +- 1."""
+        return float(np.linalg.norm(self.theta[3:])) < exp(BY_CHANCE)
+
+    def without_intervals(self, walk_std: float) -> WindowFit:
+        """The same values with quantization as a part of normal noise, spread and d forgotten."""
+        return replace(self, step=0.0, noise_std=self.noise, walk_std=walk_std, knots=np.zeros(0),
+                       spread=np.zeros(()))
 
     @property
     def valid(self) -> bool:
@@ -147,11 +154,6 @@ def gap_variance(cov: Array) -> float:
     return max(float(cov[1, 1] + cov[2, 2] - 2.0 * cov[1, 2]), 0.0)
 
 
-def agree(one: Array, other: Array, cov: Array) -> bool:
-    """Whether vectors (n,) agree by a chi-square test; cov: of their difference (n, n)."""
-    return squares_of(one - other, cov) < chi_square(CHANCE, len(one))
-
-
 def error_of_plant(
     f: WindowFit, r: Array, squares: float, freedom: float, most_scale: float,
 ) -> tuple[Array, Array, float, float, float]:
@@ -161,10 +163,10 @@ def error_of_plant(
     if not k:
         return np.zeros(0), np.zeros((0, 0)), f.scale, 0.0, variance
     u, singular, vt = np.linalg.svd(r[:k, :k])
-    z, scales = u.T @ r[:k, k], SCALES[most_scale >= SCALES][:, None]
-    noise, told, power = np.full((len(scales), 1), variance), (scales * singular) ** 2, z**2
+    z, scales = u.T @ r[:k, k], SCALES[(SCALES[0] if f.told else most_scale) >= SCALES][:, None]
+    noise, seen, power = np.full((len(scales), 1), variance), (scales * singular) ** 2, z**2
     for _ in range(1 if f.step else 4):  # noise and shrinkage depend on each other
-        shrink = 1.0 / (1.0 + told / noise)
+        shrink = 1.0 / (1.0 + seen / noise)
         left = squares + (shrink * power).sum(axis=1, keepdims=True)
         noise = noise if f.step else left / freedom
     volumes = 0.5 * (np.log(shrink).sum(axis=1) - np.log(scales[:, 0]) ** 2)

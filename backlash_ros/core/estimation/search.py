@@ -8,11 +8,10 @@ from math import inf, isfinite
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.settings import ROWS
 from backlash_ros.core.plant.backlash import play
-from backlash_ros.core.plant.numerics import lfilter, sensitivities, state_responses
+from backlash_ros.core.plant.numerics import bins_of, lfilter, sensitivities, state_responses
 from backlash_ros.core.plant.transfer_function import Array, Family
 
 
@@ -35,7 +34,7 @@ def search(
     v, y: (N,), y nan where lost. widest: largest gap considered. xi: error of G (K,) around which G
     is linearized. smallest: smallest gap over the largest (swing of v, at most `widest`).
     """
-    known, begins, (b, a) = np.isfinite(y), _bins(v), family.at(xi.tolist())
+    known, begins, (b, a) = np.isfinite(y), bins_of(v, ROWS), family.at(xi.tolist())
     readings = np.add.reduceat(known.astype(np.float64), begins)
     weights = (readings > 0.0) / np.sqrt(np.maximum(readings, 1.0))
 
@@ -101,13 +100,3 @@ def search(
     peaks = sorted((h for k, h in enumerate(found) if e[k] < e[k + 1] > e[k + 2]), reverse=True)[:3]
     rest_of_all = sorted({*found} - {*peaks}, reverse=True)
     return [*(h._replace(peak=True) for h in peaks), *rest_of_all], float(value(y_rest @ y_rest))
-
-
-def _bins(v: Array) -> NDArray[np.intp]:
-    """First samples of some 1,500 bins, spread half evenly over time and half over motion of v."""
-    count = len(v)
-    if count <= ROWS:
-        return np.arange(count)
-    move = np.abs(np.diff(v, prepend=v[0]))
-    clock = np.cumsum(0.5 / count + 0.5 * move / max(float(move.sum()), 1e-300))
-    return np.flatnonzero(np.diff(np.floor(clock * ROWS), prepend=-1.0) > 0)

@@ -24,10 +24,10 @@ from backlash_ros.core.estimation.belief import Belief, Known, State, Trial, sho
 from backlash_ros.core.estimation.explanations import Setup, afresh, mixed
 from backlash_ros.core.estimation.fit import FEW_STEPS, Problem
 from backlash_ros.core.estimation.late_commands import likelier, weighed
-from backlash_ros.core.estimation.posterior import Prior, WindowFit, agree
+from backlash_ros.core.estimation.posterior import Prior, WindowFit
 from backlash_ros.core.estimation.settings import BLOCKS, FEWEST, MISFIT, PREDICTED, SHORT_RECORD
 from backlash_ros.core.estimation.unmodelled import as_known, coasts, with_walk
-from backlash_ros.core.plant.numerics import chi_square, isolated, log_density, squares_of
+from backlash_ros.core.plant.numerics import agree, chi_square, isolated, log_density, squares_of
 from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.window import Window
 
@@ -192,7 +192,7 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
     soon = FEWEST if record.end < before.next_at else max(count // BLOCKS, FEWEST)
     trial = trial._replace(predicted=trial.predicted + count - new)
     after = before._replace(end=record.end, next_at=record.end + soon, trial=trial)
-    if record.end >= before.thorough[0] or fit.cov[2, 2] < before.thorough[1]:
+    if record.end >= before.thorough[0] or fit.cov[2, 2] < before.thorough[1] or not fit.credible:
         fit = problem.with_intervals(fit)
         if count <= SHORT_RECORD and isnan(problem.older.v):
             other = afresh(setup, record, fit, kept.older, fit)
@@ -201,7 +201,7 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
             record, fit, swapped = weighed(setup, record, fit, kept.swapped, kept.older)
             problem = setup.problem(record, kept.older)
             after = after._replace(kept=kept._replace(swapped=swapped))
-        elif fit.step or fit.spread.any():  # else the posterior is normal
+        elif fit.step or fit.spread.any() or not fit.credible:  # else the posterior is normal
             fit = mixed(problem, fit)
         fit = with_walk(problem, fit, setup.walk_std)
         after = after._replace(thorough=(record.end + 2 * count // 5, 0.25 * float(fit.cov[2, 2])))
@@ -305,15 +305,14 @@ def _beside_inherited(setup: Setup, belief: Belief, fit: WindowFit, known: Known
     (m, c_r, c_l), apart = known.crossings, fit.crossings - known.crossings
     size = np.array([m, c_r - c_l, c_r - c_l])
     prior = known.cov + np.diag((1e-9 * size) ** 2)
-    compatible = agree(fit.crossings, known.crossings, cov + prior)
+    compatible = agree(fit.crossings, known.crossings, cov + prior, settings.CHANCE)
     if not compatible:
         prior = prior + settings.LOST_MOTION**2 * np.diag(size**2 / [4.0, 2.0, 2.0])
     alike, another = cov + prior, cov + prior + np.diag(size**2)
-    if not agree(fit.crossings, known.crossings, alike):
+    if not agree(fit.crossings, known.crossings, alike, settings.CHANCE):
         # A gear that is not pure play leaves systematic residuals, or takes G beyond all that its
         # prior allows, which refutes nothing.
-        white = not fit.systematic and \
-            max(map(abs, fit.xi), default=0.0) < settings.BY_CHANCE * posterior.SCALES[-1]
+        white = not fit.systematic and fit.credible
         sure = white and fit.left.turns >= settings.HELD_REVERSALS and \
             posterior.gap_variance(cov) < (replacing * fit.gap) ** 2
         if sure and belief.trial.predicted >= belief.trial.must:

@@ -385,6 +385,21 @@ def chi_square(probability: float, freedom: float) -> float:
     return float(chdtri(freedom, probability))
 
 
+def agree(one: Array, other: Array, cov: Array, chance: float) -> bool:
+    """Whether vectors (n,) differ by no more than chance; cov: of their difference (n, n)."""
+    return squares_of(one - other, cov) < chi_square(chance, len(one))
+
+
 def log_density(apart: Array, cov: Array) -> float:
     """Log-density of a difference (n,) of this covariance (n, n), up to a constant."""
     return -0.5 * (squares_of(apart, cov) + float(np.linalg.slogdet(cov)[1]))
+
+
+def bins_of(v: Array, most: int) -> NDArray[np.intp]:
+    """First samples of some `most` bins, spread half evenly over time and half over motion of v."""
+    count = len(v)
+    if count <= most:
+        return np.arange(count)
+    move = np.abs(np.diff(v, prepend=v[0]))
+    clock = np.cumsum(0.5 / count + 0.5 * move / max(float(move.sum()), 1e-300))
+    return np.flatnonzero(np.diff(np.floor(clock * most), prepend=-1.0) > 0)

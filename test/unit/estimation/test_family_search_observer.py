@@ -28,8 +28,9 @@ PLANTS = {
 }
 
 
-def two_poles(omega_t: float) -> TransferFunction:
-    b, a, _ = cont2discrete(([omega_t**2], [1.0, omega_t, omega_t**2]), 1.0)
+def two_poles(omega_t: float, damping: float = 0.5) -> TransferFunction:
+    b, a, _ = cont2discrete(
+        ([omega_t**2], [1.0, 2.0 * damping * omega_t, omega_t**2]), 1.0)
     return TransferFunction(b[0, 1:].tolist(), a.tolist())
 
 
@@ -324,3 +325,35 @@ def test_commands_that_look_late_are_weighed_against_those_expected(late: bool) 
     assert swapped == (frozenset({100}) if late else frozenset())
     np.testing.assert_array_equal(record.v, v)
     assert abs(found.gap - 1.0) < 5.0 * found.gap_std < 0.5
+
+
+def moved_by(plant: TransferFunction, told: TransferFunction, uncertainty: float, before: bool) \
+        -> tuple[Setup, Window]:
+    """A slow triangle of v, moving a gap of 1 before or behind this plant; y has an encoder."""
+    k, step = np.arange(900), 0.01
+    v = 20.0 / np.pi * np.arcsin(np.sin(2.0 * np.pi * k / 300.0))
+    b, a = PlantFamily(plant, 0.0).at([])
+    u = v if before else lfilter(b, a, v)
+    y = play(u, 1.0, u[0] + 0.5) - 0.5
+    y = (lfilter(b, a, y) if before else y) + 0.5 * step * np.random.default_rng(1).normal(size=900)
+    setup = Setup(PlantFamily(told, uncertainty), step, Parameters().estimator.bounds, 10.0, 0.3,
+                  0.0, np.zeros(3))
+    return setup, Window(0, v, step * np.round(y / step), np.full(len(v), np.nan))
+
+
+def test_what_no_credible_error_of_G_explains_is_left_to_friction_and_compliance() -> None:
+    setup, record = moved_by(two_poles(0.3, 0.8), two_poles(0.3, 0.8), 0.01, before=False)
+    fit = afresh(setup, record)
+    assert fit is not None
+    assert np.abs(fit.xi).max() < 0.1
+    assert setup.is_known(fit)
+    assert abs(fit.gap - 1.0) < min(0.03, fit.gap_std)
+
+
+@pytest.mark.parametrize('uncertainty', [0.2, 0.01])
+def test_a_gap_that_depends_on_an_incredible_error_of_G_is_not_known(uncertainty: float) -> None:
+    setup, record = moved_by(two_poles(0.13), two_poles(0.1), uncertainty, before=True)
+    fit = afresh(setup, record)
+    assert fit is not None
+    assert abs(fit.gap - 1.0) < 0.05  # which is right, as this plant is as the model
+    assert setup.is_known(fit) is (uncertainty == 0.2)
