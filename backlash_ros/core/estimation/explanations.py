@@ -153,11 +153,13 @@ def afresh(
 def mixed(p: Problem, best: WindowFit, others: Sequence[WindowFit] = ()) -> WindowFit:
     """The likeliest of these fits and of others nearby, with the spread of the mixture.
 
-    If its G is incredible: the fit with G as told, if that leaves no more than friction and
+    If its G is incredible: the fit with G as told, if that leaves no more motion than friction and
     compliance do, which xi then makes up for; else that fit adds to the spread.
     """
     told = best if best.credible else p.as_told(best)
-    if told is not best and told.valid and told.unexplained < settings.NEGLIGIBLE:
+    # Motion of u that it leaves, but not the other fit.
+    more = sqrt(max(told.left.rms**2 - best.left.rms**2, 0.0)) / told.left.gain
+    if told is not best and told.valid and more < settings.NEGLIGIBLE * told.m * told.gap:
         return mixed(p, told)
     wider, beyond = _along_the_gap(p, best)
     # Only between fits that take readings in the same way can evidences be compared.

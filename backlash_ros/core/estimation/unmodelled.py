@@ -61,11 +61,9 @@ def _coasting_score(problem: Problem, fit: WindowFit) -> float:
 
 def with_walk(problem: Problem, f: WindowFit, least: float) -> WindowFit:
     """The fit, or one with a larger random walk of u if that explains correlated residuals."""
-    if f.told:  # friction and compliance are no walk
-        return f
     begin = f.without_intervals(least)
     best = f if f.walk_std == least else problem.with_intervals(problem.fitted(begin))
-    if not best.valid or not best.systematic:
+    if f.told or not best.valid or not best.systematic:  # friction and compliance are no walk
         return best
     for share in (0.005, 0.02, 0.08):  # walk over the record, in units of m times the gap
         walk_std = share * f.m * f.gap / sqrt(len(problem.v))

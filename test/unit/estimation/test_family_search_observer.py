@@ -7,12 +7,14 @@ from scipy.optimize import least_squares
 from scipy.signal import cont2discrete
 from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR
 
+from backlash_ros.core.estimation.belief import Belief
 from backlash_ros.core.estimation.explanations import Setup, afresh
 from backlash_ros.core.estimation.fit import Problem
 from backlash_ros.core.estimation.late_commands import weighed
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.posterior import WindowFit
 from backlash_ros.core.estimation.search import search
+from backlash_ros.core.estimation.state_machine import learn
 from backlash_ros.core.parameters import Bounds, Parameters
 from backlash_ros.core.plant.backlash import play
 from backlash_ros.core.plant.numerics import RATIOS, gain_of, lfilter
@@ -327,15 +329,18 @@ def test_commands_that_look_late_are_weighed_against_those_expected(late: bool) 
     assert abs(found.gap - 1.0) < 5.0 * found.gap_std < 0.5
 
 
-def moved_by(plant: TransferFunction, told: TransferFunction, uncertainty: float, before: bool) \
-        -> tuple[Setup, Window]:
+def moved_by(
+    plant: TransferFunction, told: TransferFunction, uncertainty: float, before: bool,
+    count: int = 900,
+) -> tuple[Setup, Window]:
     """A slow triangle of v, moving a gap of 1 before or behind this plant; y has an encoder."""
-    k, step = np.arange(900), 0.01
+    k, step = np.arange(count), 0.01
     v = 20.0 / np.pi * np.arcsin(np.sin(2.0 * np.pi * k / 300.0))
     b, a = PlantFamily(plant, 0.0).at([])
     u = v if before else lfilter(b, a, v)
     y = play(u, 1.0, u[0] + 0.5) - 0.5
-    y = (lfilter(b, a, y) if before else y) + 0.5 * step * np.random.default_rng(1).normal(size=900)
+    y = lfilter(b, a, y) if before else y
+    y += 0.5 * step * np.random.default_rng(1).normal(size=count)
     setup = Setup(PlantFamily(told, uncertainty), step, Parameters().estimator.bounds, 10.0, 0.3,
                   0.0, np.zeros(3))
     return setup, Window(0, v, step * np.round(y / step), np.full(len(v), np.nan))
@@ -357,3 +362,16 @@ def test_a_gap_that_depends_on_an_incredible_error_of_G_is_not_known(uncertainty
     assert fit is not None
     assert abs(fit.gap - 1.0) < 0.05  # which is right, as this plant is as the model
     assert setup.is_known(fit) is (uncertainty == 0.2)
+
+
+def test_friction_and_compliance_are_allowed_for_after_an_event_that_spoils_the_record() -> None:
+    servo = two_poles(0.3, 0.8)
+    setup, record = moved_by(servo, servo, 0.01, before=False, count=1800)
+    record.y[:300] += 3.0 * np.sin(0.9 * np.arange(300))
+    belief = Belief()
+    for end in (1500, 1600, 1700, 1790):
+        belief = learn(setup, record.between(belief.kept.first, end), belief)
+    assert belief.trusted
+    assert belief.published is not None
+    _, c_r, c_l = belief.published.crossings
+    assert abs(c_r - c_l - 1.0) < 0.03
