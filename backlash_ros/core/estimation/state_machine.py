@@ -312,7 +312,7 @@ def _beside_inherited(setup: Setup, belief: Belief, fit: WindowFit, known: Known
     if not agree(fit.crossings, known.crossings, alike, settings.CHANCE):
         # A gear that is not pure play leaves systematic residuals, or takes G beyond all that its
         # prior allows, which refutes nothing.
-        white = not fit.systematic and fit.credible
+        white = fit.credible and not (fit.systematic or fit.told)
         sure = white and fit.left.turns >= settings.HELD_REVERSALS and \
             posterior.gap_variance(cov) < (replacing * fit.gap) ** 2
         if sure and belief.trial.predicted >= belief.trial.must:
