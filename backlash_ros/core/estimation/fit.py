@@ -166,9 +166,9 @@ class Problem:
         """What the first `count` samples and older ones say of theta, without the prior of xi."""
         number = np.full(len(self.v), -1)
         number[self.known] = self.at(f).number
-        told = ~np.isin(number[:count], number[count:])  # else the rest of the record tells it, too
+        unrepeated = ~np.isin(number[:count], number[count:])  # the rest of the record tells others
         rows = self.rows(f)
-        r = triangle(np.vstack([rows[:count][told], rows[len(self.v):]]))
+        r = triangle(np.vstack([rows[:count][unrepeated], rows[len(self.v):]]))
         at = len(r) - 4 - self.family.count
         return Prior(r[at:-1, at:-1], r[at:-1, -1])
 

@@ -31,8 +31,7 @@ PLANTS = {
 
 
 def two_poles(omega_t: float, damping: float = 0.5) -> TransferFunction:
-    b, a, _ = cont2discrete(
-        ([omega_t**2], [1.0, 2.0 * damping * omega_t, omega_t**2]), 1.0)
+    b, a, _ = cont2discrete(([omega_t**2], [1.0, 2.0 * damping * omega_t, omega_t**2]), 1.0)
     return TransferFunction(b[0, 1:].tolist(), a.tolist())
 
 
