@@ -4,9 +4,11 @@
     make accuracy ARGS='--only bound faults'   some rows
     make accuracy ARGS='--scale 5'             five times as many runs, for smaller scatter
     make accuracy ARGS='--reference'           what was measured becomes the reference
+    make accuracy ARGS='--reference FILE'      what another commit has measured, with --out FILE
 
 Every row is a fixed set of seeded runs, and its figures have the scatter that other seeds would
 show. What is worse than in the reference by more than three standard deviations ends it with 1.
+Rows of time are compared with those of the same machine: their ratios do not carry over.
 """
 
 import json
@@ -26,7 +28,7 @@ os.environ.setdefault('OMP_NUM_THREADS', '1')
 import faults
 import ordinary_motions
 from contract import following_rows, learning_rows, situation_rows, timing_rows
-from contract.figures import COMPARED_HEADER, Figure, Row, as_json, compare, show
+from contract.figures import COMPARED_HEADER, Row, as_json, compare, from_json, show
 from reporting import ROOT, format_table, machine, markdown_table, parser_of
 from tqdm import tqdm
 
@@ -97,16 +99,21 @@ def _prepare() -> None:
 
 def read_rows(path: Path) -> dict[str, Row]:
     """Rows of a file of results; none where there is no file."""
-    rows = json.loads(path.read_text())['rows'] if path.exists() else {}
-    return {name: {what: Figure(**values) for what, values in row.items()}
-            for name, row in rows.items()}
+    return from_json(json.loads(path.read_text())['rows']) if path.exists() else {}
 
 
 def write_rows(path: Path, rows: dict[str, Row]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     kept = {**read_rows(path), **rows}
-    ordered = {name: kept[name] for name in ROWS if name in kept}
-    path.write_text(json.dumps({'machine': machine(), 'rows': as_json(ordered)}, indent=1) + '\n')
+    write_json(path, {'machine': machine(), 'rows': as_json(in_order(kept))})
+
+
+def write_json(path: Path, content: object) -> None:
+    path.write_text(json.dumps(content, indent=1) + '\n')
+
+
+def in_order(rows: dict[str, Row]) -> dict[str, Row]:
+    return {name: rows[name] for name in ROWS if name in rows}
 
 
 HEAD = """# Accuracy: what was measured
@@ -117,22 +124,46 @@ the scatter that other seeds would show. Errors are those of c_r or c_l, the wor
 *Beyond five deviations*: share of the *tracking* samples whose error is larger than five published
 deviations; *wrong while tracking*: that, and more than 1 % of the gap. Times are in units of one
 predict + update of a Kalman filter with six states, those over DDS in units of a bare echo node.
+As these units do not carry over from one processor to another, there is a column for each: what
+commit 0c6e90c4 measured there, and for `identify` 85dd56ba.
 What each row is: [accuracy.py](../../benchmarks/accuracy.py).
 The reference is that of the estimator before the present one, whose figures on ordinary motions
 are in [estimation.md](../estimation.md#the-motions-of-most-machines)."""
 
 
-def adopt(rows: dict[str, Row]) -> None:
-    """Let these rows be the reference, and write it as Markdown."""
-    write_rows(REFERENCE, rows)
-    sections = [
-        f'## {name.capitalize()}\n\n' + markdown_table(
-            ('figure', 'value', 'runs'),
-            [[what, show(one), str(one.runs)] for what, one in row.items()])
-        for name, row in read_rows(REFERENCE).items()
-    ]
-    PAGE.write_text('\n\n'.join([HEAD, *sections]) + '\n')
-    print(f'wrote {", ".join(rows)} into {REFERENCE.relative_to(ROOT)}')
+class Reference(NamedTuple):
+    """Rows that hold anywhere, and rows of time by the machine on which they were measured."""
+
+    rows: dict[str, Row]
+    times: dict[str, dict[str, Row]]
+
+    @classmethod
+    def read(cls) -> 'Reference':
+        content = json.loads(REFERENCE.read_text())
+        return cls(from_json(content['rows']),
+                   {where: from_json(rows) for where, rows in content['times'].items()})
+
+    def at(self, where: str) -> dict[str, Row]:
+        return {**self.rows, **self.times.get(where, {})}
+
+    def adopt(self, rows: dict[str, Row], where: str) -> None:
+        """Take over rows that were measured on this machine, and write everything anew."""
+        for name, row in rows.items():
+            (self.times.setdefault(where, {}) if ROWS[name].alone else self.rows)[name] = row
+        write_json(REFERENCE, {
+            'rows': as_json(in_order(self.rows)),
+            'times': {name: as_json(in_order(of)) for name, of in self.times.items()}})
+        PAGE.write_text('\n\n'.join([HEAD, *map(self._section, ROWS)]) + '\n')
+
+    def _section(self, name: str) -> str:
+        columns = {where: rows[name] for where, rows in self.times.items() if name in rows} \
+            if ROWS[name].alone else {'value': self.rows[name]}
+        figures = dict.fromkeys(what for row in columns.values() for what in row)
+        return f'## {name.capitalize()}\n\n' + markdown_table(
+            ('figure', *columns, 'runs'),
+            [[what, *(show(row[what]) if what in row else '–' for row in columns.values()),
+              str(max(row[what].runs for row in columns.values() if what in row))]
+             for what in figures])
 
 
 def main() -> int:
@@ -145,15 +176,22 @@ def main() -> int:
                         help=f'processes beside each other, default {WORKERS}')
     parser.add_argument('--out', type=Path, default=RESULT,
                         help='rows that it holds and that are not measured now stay in it')
-    parser.add_argument('--reference', action='store_true',
-                        help=f'write these rows into {REFERENCE.relative_to(ROOT)}')
+    parser.add_argument('--reference', nargs='?', const=True, metavar='FILE',
+                        help='write these rows, or those that another commit has left in a file, '
+                             f'into {REFERENCE.relative_to(ROOT)}')
     arguments = parser.parse_args()
     if unknown := [name for name in arguments.only if name not in ROWS]:
         parser.error(f'--only {unknown[0]!r} must be of: {"; ".join(ROWS)}')
     if not (arguments.scale > 0.0 and arguments.workers > 0):
         parser.error('--scale and --workers must be > 0')
-    before = read_rows(REFERENCE)
-    rows: dict[str, Row] = {}
+    reference = Reference.read()
+    if isinstance(arguments.reference, str):
+        if not Path(arguments.reference).exists():
+            parser.error(f'--reference {arguments.reference!r}: there is no such file')
+        of_another = json.loads(Path(arguments.reference).read_text())
+        reference.adopt(from_json(of_another['rows']), of_another['machine'])
+        return 0
+    before, rows = reference.at(machine()), dict[str, Row]()
     for name in filter(arguments.only.__contains__, ROWS):
         begun, used = time.monotonic(), sum(os.times()[:4])
         rows[name] = row = measure(name, arguments.scale, arguments.workers)
@@ -166,13 +204,15 @@ def main() -> int:
             for what, one in row.items()
         ]), flush=True)
         write_rows(arguments.out, {name: row})
+    if unknown := [name for name in rows if name not in before]:
+        print(f'\nnot compared, as nothing is known of this machine: {", ".join(unknown)}')
     worse, better = compare(rows, before)
     for what, found in (('better', better), ('worse', worse)):
         print(f'\n{what} than the reference: {len(found) or "nothing"}')
         if found:
             print(format_table(COMPARED_HEADER, found))
     if arguments.reference:
-        adopt(rows)
+        reference.adopt(rows, machine())
         return 0
     return 1 if worse else 0
 

@@ -103,6 +103,11 @@ def as_json(rows: Mapping[str, Row]) -> dict[str, dict[str, dict[str, Any]]]:
     } for name, row in rows.items()}
 
 
+def from_json(rows: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> dict[str, Row]:
+    return {name: {what: Figure(**values) for what, values in row.items()}
+            for name, row in rows.items()}
+
+
 COMPARED_HEADER = ('row', 'figure', 'reference', 'now', 'deviations')
 Cells = list[list[str]]
 
