@@ -10,7 +10,7 @@ from math import inf, isnan, sqrt
 import numpy as np
 
 from backlash_ros.core.estimation import settings
-from backlash_ros.core.estimation.fit import FEW_STEPS, FIRST_STEPS, Problem
+from backlash_ros.core.estimation.fit import FEW_STEPS, FIRST_STEPS, NEAR, Problem
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.posterior import Prior, WindowFit, gap_variance
 from backlash_ros.core.estimation.search import search
@@ -115,7 +115,6 @@ def afresh(
         if not found or found[0].evidence < null + settings.ENGAGED:
             return None
         gaps = [f.gap for f in known if f.behind(xi) < 1.0]  # another G, another optimum
-        begun = dict[WindowFit, float]()  # with the evidence that the search has found
         for evidence, gap, p0, m, peak in found:
             # Around the wrong G, the evidence of another optimum may be far too low.
             near = peak or evidence > found[0].evidence - settings.FAR_BEHIND
@@ -125,13 +124,8 @@ def afresh(
                 gaps.append(gap)
                 theta = np.concatenate([[m, m * (p0 - first), gap], xi])
                 begin = WindowFit(np.zeros(1), p0, theta, noise, walk_std=setup.walk_std)
-                begun[p.step(begin, 1.0, held=True, begun=True)] = evidence
-        free = [p.finished(p.fitted(f, FIRST_STEPS)) for f in begun]
-        # A fit further behind than its hypothesis was has lost its way: hold its gap for a while.
-        gains = np.array([f.evidence for f in free]) - [*begun.values()]
-        held = [_with_gap(p, f, f.gap, p.at(f).weights, -inf, 0.0)[1] for f, gain
-                in zip(begun, gains, strict=True) if gain < gains.max() - settings.FAR_BEHIND]
-        fits += [*free, *(p.finished(p.fitted(f, FIRST_STEPS)) for f in held)]
+                begin = p.step(begin, NEAR[0], held=True, begun=True)
+                fits.append(p.finished(p.fitted(begin, FIRST_STEPS)))
         best = max(fits, key=lambda f: f.evidence, default=None)
         if best is None or (best.valid and best.behind(xi) < 1.0):
             break

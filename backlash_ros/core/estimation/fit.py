@@ -27,6 +27,7 @@ from backlash_ros.core.plant.numerics import lfilter, padded, sensitivities, shi
 from backlash_ros.core.plant.transfer_function import Array, Family
 
 STEPS, FIRST_STEPS, FEW_STEPS = 16, 6, 3  # limits on the number of Gauss-Newton steps
+NEAR = 0.1, 0.3, 1.0, 1.0  # how far xi moves in the first steps, where the linearization is bad
 
 
 class Run(NamedTuple):
@@ -128,15 +129,15 @@ class Problem:
         return value if isfinite(value) else -inf
 
     def step(
-        self, f: WindowFit, most_scale: float = inf, held: bool = False, begun: bool = False,
+        self, f: WindowFit, reach: float = inf, held: bool = False, begun: bool = False,
     ) -> WindowFit:
         """One Gauss-Newton step: posterior mean and covariance of the model linearized around f.
 
-        most_scale: limits s. held: keep the gap. begun: keep p0. Raises LinAlgError if not finite.
+        reach: how far xi moves. held, begun: keep gap, p0. Raises LinAlgError if not finite.
         """
         from scipy.linalg.lapack import dtrtri  # late: 31 MB that only fits need
 
-        r, run = triangle(self.rows(f, held, begun)), self.at(f)
+        r, run = triangle(self.rows(f, reach, held, begun)), self.at(f)
         if not np.isfinite(r).all():
             raise np.linalg.LinAlgError('the samples leave no finite posterior')
         # eta, all unknowns but the error of G, is R11^-1 (d1 - R12 xi) + R11^-1 noise.
@@ -148,8 +149,7 @@ class Problem:
         of_xi[:n] = -of_eta[:n] @ r[:n, n:-1]
         freedom = max(float(run.weights.sum()) - n, 0.0) + 1.0
         squares = float(r[size, size]) ** 2 + (self.nominal / f.noise_std) ** 2
-        xi, cov_xi, scale, volume, noise = posterior.error_of_plant(
-            f, r[n:, n:], squares, freedom, most_scale)
+        xi, cov_xi, scale, volume, noise = posterior.error_of_plant(f, r[n:, n:], squares, freedom)
         beta = of_eta @ r[:n, -1] + of_xi @ xi
         swing, first = float(np.ptp(self.v)), float(self.v[0])
         # With a gap of exactly 0, both sides would be engaged at once.
@@ -172,7 +172,9 @@ class Problem:
         at = len(r) - 4 - self.family.count
         return Prior(r[at:-1, at:-1], r[at:-1, -1])
 
-    def rows(self, f: WindowFit, held: bool = False, begun: bool = False) -> Array:
+    def rows(
+        self, f: WindowFit, reach: float = inf, held: bool = False, begun: bool = False,
+    ) -> Array:
         """Least-squares rows of a step: N samples, B priors; target last, (N + B, P + 1)."""
         vague = 100.0  # prior standard deviation of X, over the largest reading
         tight = 1e6  # weight by which an unknown keeps its value
@@ -185,6 +187,7 @@ class Problem:
         at = len(x) + len(knots) + 1  # index of m
         *unit, target, none = np.eye(len(beta) + 2, len(beta) + 1)
         p0, gap, older = unit[at - 1], unit[at + 2], self.older
+        near = zip(unit[at + 3:], f.xi, strict=True) if reach < inf else ()
         begin = sqrt(12.0) / max(f.gap, 1e-9) * (p0 + (first + 0.5 * f.gap) * target) \
             if isnan(older.v) else tight * (p0 - older.left * gap + older.v * target)
         beside = [
@@ -192,6 +195,7 @@ class Problem:
             tight * (gap + f.gap * target) if held else gap / max(float(np.ptp(self.v)), 1e-300),
             tight * (p0 + f.p0 * target) if begun else begin,
             *unit[at + 3:at + 3 + self._leaks],
+            *((row + x * target) / reach for row, x in near),
             # Keeps X finite where no reading determines it, as when the first ones were lost.
             *(row / (vague * max(float(np.abs(self.y).max()), 1e-300)) for row in unit[:len(x)]),
             *((one - other) / knot_std for one, other in pairwise([*unit[len(x):at - 1], none])),
@@ -213,24 +217,21 @@ class Problem:
 
     def fitted(self, f: WindowFit, steps: int = STEPS, least_gain: float = 0.0) -> WindowFit:
         """Take Gauss-Newton steps from f until they converge or gain under `least_gain` nats."""
-        # Number of first steps in which s is at most 1: G no more wrong than configured.
-        far_steps = 4 * (self.family.count > self.family.leaks)
         # A gap that moves by fewer standard deviations has converged, unless 1 nat is still gained.
-        least_move = 0.02 if steps > FEW_STEPS else 0.2
-        for k in range(steps):
-            weights = self.at(f).weights
+        near, least_move = (iter(NEAR), 0.02) if steps > FEW_STEPS else (iter(()), 0.2)
+        for _ in range(steps):
+            weights, reach = self.at(f).weights, next(near, inf) if self.family.count else inf
             best = self.log_posterior(f, weights)
-            # Far from the optimum, errors of the linearization would be taken for errors of G.
-            most = 1.0 if k < far_steps < steps else inf
-            new, there, value = self._stepped(f, best, weights, most, False, False)
+            new, there, value = self._stepped(f, best, weights, reach, False, False)
             if not value > best - 0.5:
                 # A kink at p0, or an undetermined gap, may block progress: hold p0, or the gap.
                 for held in (False, True):
-                    _, beside, of_it = self._stepped(f, best, weights, most, held, not held)
+                    _, beside, of_it = self._stepped(f, best, weights, reach, held, not held)
                     if of_it > value:
                         there = replace(beside, cov=new.cov, scale=new.scale, volume=new.volume)
                         value = of_it
-            if not value > best - 50.0:  # f stays, and is known no better than before
+            stays = not value > best - 50.0
+            if stays and reach == inf:  # and is known no better than before
                 cov = f.cov if f.cov.size else new.cov
                 f = replace(f, cov=cov, scale=new.scale, volume=new.volume)
                 again = f if f.step else self._with_noise(f)
@@ -239,23 +240,24 @@ class Problem:
                 f = again
                 continue
             moved = abs(there.gap - f.gap) / max(sqrt(max(new.cov[2, 2], 0.0)), 1e-300)
-            f = there if there.step else self._with_noise(there)
-            if value - best < (1.0 if moved < least_move else least_gain):
-                if most == inf:
+            if not stays:
+                f = there if there.step else self._with_noise(there)
+            if stays or value - best < (1.0 if moved < least_move else least_gain):
+                if reach == inf:
                     break
-                far_steps = 0
+                near = iter(())
         return f
 
     def _stepped(
-        self, f: WindowFit, best: float, w: Array, most_scale: float, held: bool, begun: bool,
+        self, f: WindowFit, best: float, w: Array, reach: float, held: bool, begun: bool,
     ) -> tuple[WindowFit, WindowFit, float]:
-        new = self.step(f, most_scale, held, begun)
+        new = self.step(f, reach, held, begun)
         there = self.towards(f, new)
         value = self.log_posterior(there, w)
         if -inf < value <= best - 0.5:
             # Beyond a kink, where the other side is engaged, a second step may succeed.
             with suppress(np.linalg.LinAlgError):
-                again = self.towards(there, self.step(there, most_scale, held, begun))
+                again = self.towards(there, self.step(there, reach, held, begun))
                 of_again = self.log_posterior(again, w)
                 if of_again > best:
                     there, value = again, of_again

@@ -155,7 +155,7 @@ def gap_variance(cov: Array) -> float:
 
 
 def error_of_plant(
-    f: WindowFit, r: Array, squares: float, freedom: float, most_scale: float,
+    f: WindowFit, r: Array, squares: float, freedom: float,
 ) -> tuple[Array, Array, float, float, float]:
     """Posterior of xi, over a grid of s: mean, covariance, most probable s, its share of `volume`,
     and noise variance over that of f. r: triangle of xi, (K + 1, K + 1); squares: of residuals."""
@@ -163,7 +163,7 @@ def error_of_plant(
     if not k:
         return np.zeros(0), np.zeros((0, 0)), f.scale, 0.0, variance
     u, singular, vt = np.linalg.svd(r[:k, :k])
-    z, scales = u.T @ r[:k, k], SCALES[(SCALES[0] if f.told else most_scale) >= SCALES][:, None]
+    z, scales = u.T @ r[:k, k], SCALES[:1 if f.told else None][:, None]
     noise, seen, power = np.full((len(scales), 1), variance), (scales * singular) ** 2, z**2
     for _ in range(1 if f.step else 4):  # noise and shrinkage depend on each other
         shrink = 1.0 / (1.0 + seen / noise)

@@ -65,13 +65,16 @@ def with_walk(problem: Problem, f: WindowFit, least: float) -> WindowFit:
     best = f if f.walk_std == least else problem.with_intervals(problem.fitted(begin))
     if f.told or not best.valid or not best.systematic:  # friction and compliance are no walk
         return best
+    seems_to_coast = _coasting_score(problem, best) > settings.BY_CHANCE
     for share in (0.005, 0.02, 0.08):  # walk over the record, in units of m times the gap
         walk_std = share * f.m * f.gap / sqrt(len(problem.v))
         if walk_std > least:
             walks = replace(begin, walk_std=walk_std)
             g = problem.with_intervals(problem.fitted(walks, FIRST_STEPS))
             needed = 0.0 if best.walk_std > least else settings.FAR_BEHIND
-            rho = min(g.left.correlation, 0.999)  # of a first-order process: fewer independent ones
-            if g.valid and g.evidence - best.evidence > needed * (1.0 + rho) / (1.0 - rho):
+            # Fewer independent residuals: those of a first-order process; if a load coasts, one.
+            rho = min(g.left.correlation, 0.999)
+            fewer = g.inflation if seems_to_coast else (1.0 + rho) / (1.0 - rho)
+            if g.valid and g.evidence - best.evidence > needed * fewer:
                 best = g
     return best

@@ -74,6 +74,15 @@ def test_wear_and_a_step_of_a_crossing_are_followed(seed: int) -> None:
     assert max(c_r[100:1000].max(), c_r[1100:].max()) <= 0.03
 
 
+@pytest.mark.parametrize('seed', [1, 4])
+def test_what_a_load_leaves_that_coasts_a_little_is_taken_for_no_walk_of_u(seed: int) -> None:
+    job = [job for job in changes_jobs(1.0) if job.group == 'coasting, d = 0.5'][seed - 1]
+    found = run_job(job).judged
+    assert found is not None
+    assert found.at(5.0) < 0.02
+    assert found.tracking.mean() > 0.6
+
+
 def test_a_jump_that_the_error_of_g_can_explain_at_first_is_learned_as_soon_as_any() -> None:
     job = [job for job in changes_jobs(1.0) if job.group == 'jump'][9]
     assert 0.0 < learned_again_s(run_job(job).judged) < 0.45

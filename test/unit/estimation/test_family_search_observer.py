@@ -173,6 +173,24 @@ def test_a_wrong_sign_is_named_only_where_it_is_certain() -> None:
         assert setup.moves_against(fit) is named
 
 
+def test_a_fit_that_begins_at_its_optimum_ends_there() -> None:
+    rng = np.random.default_rng(4)
+    v = np.cumsum(rng.normal(0.0, 0.4, 400))
+    family = PlantFamily(two_poles(0.1), 0.2)
+    xi = np.log(2.0) / 0.2  # G is twice as fast as the nominal one
+    y = lfilter(*family.at([0.0, 0.0, xi, 0.0]), 1.5 * (play(v, 1.0, v[0]) - 0.3))
+    y += 1e-3 * rng.standard_normal(len(v))
+    setup = Setup(family, 1e-3, Parameters().estimator.bounds, 20.0, 2.0, 0.0, np.zeros(3))
+    record = Window(0, v, y, np.full(len(v), np.nan))
+    problem, best = setup.problem(record), afresh(setup, record)
+    assert best is not None
+    assert best.xi[2] == pytest.approx(xi, abs=0.05)
+    again = problem.finished(problem.fitted(best))
+    assert again.theta == pytest.approx(best.theta, rel=1e-3, abs=1e-3)
+    assert again.scale == best.scale > 1.0
+    assert again.evidence == pytest.approx(best.evidence, abs=0.1)
+
+
 def test_readings_that_repeat_one_rounding_count_as_one() -> None:
     y, known = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 9.0]), np.arange(6) < 5
     weights, number = independence(y, known, np.full(6, 1.2), 1.0)
