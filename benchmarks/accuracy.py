@@ -154,6 +154,7 @@ class Reference(NamedTuple):
             'rows': as_json(in_order(self.rows)),
             'times': {name: as_json(in_order(of)) for name, of in self.times.items()}})
         PAGE.write_text('\n\n'.join([HEAD, *map(self._section, ROWS)]) + '\n')
+        print(f'wrote {", ".join(rows)} into {REFERENCE.relative_to(ROOT)}')
 
     def _section(self, name: str) -> str:
         columns = {where: rows[name] for where, rows in self.times.items() if name in rows} \
@@ -176,7 +177,7 @@ def main() -> int:
                         help=f'processes beside each other, default {WORKERS}')
     parser.add_argument('--out', type=Path, default=RESULT,
                         help='rows that it holds and that are not measured now stay in it')
-    parser.add_argument('--reference', nargs='?', const=True, metavar='FILE',
+    parser.add_argument('--reference', nargs='?', const=True, type=Path, metavar='FILE',
                         help='write these rows, or those that another commit has left in a file, '
                              f'into {REFERENCE.relative_to(ROOT)}')
     arguments = parser.parse_args()
@@ -185,10 +186,10 @@ def main() -> int:
     if not (arguments.scale > 0.0 and arguments.workers > 0):
         parser.error('--scale and --workers must be > 0')
     reference = Reference.read()
-    if isinstance(arguments.reference, str):
-        if not Path(arguments.reference).exists():
-            parser.error(f'--reference {arguments.reference!r}: there is no such file')
-        of_another = json.loads(Path(arguments.reference).read_text())
+    if isinstance(arguments.reference, Path):
+        if not arguments.reference.exists():
+            parser.error(f'--reference {arguments.reference}: there is no such file')
+        of_another = json.loads(arguments.reference.read_text())
         reference.adopt(from_json(of_another['rows']), of_another['machine'])
         return 0
     before, rows = reference.at(machine()), dict[str, Row]()
