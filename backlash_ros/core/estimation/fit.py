@@ -230,8 +230,10 @@ class Problem:
                     if of_it > value:
                         there = replace(beside, cov=new.cov, scale=new.scale, volume=new.volume)
                         value = of_it
-            stays = not value > best - 50.0
-            if stays and reach == inf:  # and is known no better than before
+            if not value > best - 50.0:  # f stays, and is known no better than before
+                if reach < inf:  # but it may move if xi is free to
+                    near = iter(())
+                    continue
                 cov = f.cov if f.cov.size else new.cov
                 f = replace(f, cov=cov, scale=new.scale, volume=new.volume)
                 again = f if f.step else self._with_noise(f)
@@ -240,9 +242,8 @@ class Problem:
                 f = again
                 continue
             moved = abs(there.gap - f.gap) / max(sqrt(max(new.cov[2, 2], 0.0)), 1e-300)
-            if not stays:
-                f = there if there.step else self._with_noise(there)
-            if stays or value - best < (1.0 if moved < least_move else least_gain):
+            f = there if there.step else self._with_noise(there)
+            if value - best < (1.0 if moved < least_move else least_gain):
                 if reach == inf:
                     break
                 near = iter(())
