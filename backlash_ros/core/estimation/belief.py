@@ -82,20 +82,20 @@ def shortened(
     setup: Setup, record: Window, problem: Problem, belief: Belief, fit: WindowFit,
 ) -> tuple[Belief, WindowFit]:
     """Drop the oldest samples once the others suffice; what they say of theta stays as a prior."""
-    count, kept, cut = len(record.v), belief.kept, 0
+    count, kept, cut, run = len(record.v), belief.kept, 0, problem.at(fit)
     drift = setup.drift**2 * count / 3.0
     if count >= settings.LONGEST or (
             count > 4 * settings.PREDICTED and (drift > np.diag(fit.crossings_cov)).any()):
         cut = count // 3
     elif count >= settings.ROWS:
-        turns = reversals(engaged(record.v, problem.at(fit).p, fit.gap))
+        turns = reversals(engaged(run.v, run.p, fit.gap))
         if len(turns) > settings.HELD_REVERSALS:
             cut = min(count // 3, int(turns[-settings.HELD_REVERSALS]) - 1)
     if cut < count // 6:
         return belief, fit
     rest = record.between(record.first + cut)
-    p = problem.at(fit).p[:cut]
-    side = engaged(record.v[:cut], p, fit.gap)[-1]
+    p = run.p[:cut]
+    side = engaged(run.v[:cut], p, fit.gap)[-1]
     left = bool(side == Region.LEFT)
     v = nan if side == Region.GAP else float(p[-1] - fit.gap if left else p[-1])
     begin = replace(fit, p0=float(p[-1]), x=np.zeros(len(fit.x)), knots=np.zeros(0))

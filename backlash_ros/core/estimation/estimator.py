@@ -3,7 +3,6 @@
 Moving-horizon estimation (C. V. Rao et al., IEEE Trans. Automatic Control 48 (2003) 246-258).
 """
 
-from contextlib import suppress
 from dataclasses import replace
 from math import hypot, nan
 from typing import NamedTuple
@@ -15,10 +14,10 @@ from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.estimation import settings
 from backlash_ros.core.estimation.belief import Belief, Kept, Known
 from backlash_ros.core.estimation.explanations import Setup
-from backlash_ros.core.estimation.fit import FEW_STEPS
 from backlash_ros.core.estimation.observer import Following, Place
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.state_machine import learn
+from backlash_ros.core.estimation.unmodelled import as_known
 from backlash_ros.core.jobs import Executor, Failure
 from backlash_ros.core.law import Interval, Law, LawReport
 from backlash_ros.core.laws.fixed import FixedBacklash
@@ -58,16 +57,13 @@ def fitted(
     if fit is None or belief.published is None:
         return Fitted(belief)
     part = record.swapped(kept.swapped ^ before.kept.swapped).between(kept.first, belief.end)
-    problem, crossings = setup.problem(part, kept.older), fit.crossings
-    if belief.inherited is not None:
-        crossings = belief.published.crossings
-        if not fit.systematic:  # holding it improves x and xi, unless they absorb friction
-            problem = problem.holding(*crossings.tolist())
-            with suppress(np.linalg.LinAlgError):
-                fit = problem.fitted(fit, FEW_STEPS)
+    problem, known = setup.problem(part, kept.older), belief.published
+    if belief.inherited is not None or fit.wiener:
+        fit = as_known(problem, known.crossings if belief.inherited else fit.crossings, fit)
     run, last = problem.at(fit), min(len(part.v), 4 * setup.family.memory, settings.ROWS)
     u, y = run.u[-last:], part.y[-last:]
-    place = Place(float(run.p[-1]), u, y, model, state_after(model, u, y), crossings)
+    place = Place(float(run.p[-1]), u, y, model, state_after(model, u, y), fit.crossings,
+                  max(fit.noise, fit.left.rms))
     if not len(proposed) or not belief.trusted or fit.behind(proposed) <= 1.0:
         return Fitted(belief, place)
     better = StateModel(setup.family.model_at(fit.xi))
@@ -169,9 +165,9 @@ class MovingHorizon(Law):
         if self.adapting and not self._recording:
             # Start a new record: samples before the pause do not join those after it.
             before, end = self._belief, self._record.end
-            self._belief = Belief(
-                kept=Kept(first=end), end=end, next_at=end + settings.FIRST_FIT,
-                published=before.published, inherited=before.inherited or before.published)
+            self._belief = Belief(kept=Kept(first=end), end=end, next_at=end + settings.FIRST_FIT,
+                                  published=before.published,
+                                  inherited=before.inherited or before.published)
         self._recording = self.adapting
         self._lost_in_a_row = self._lost_in_a_row + 1 if y is None else 0
         following, family = self._following, self._setup.family
@@ -227,13 +223,12 @@ class MovingHorizon(Law):
             return
         self._proposed = result.better or self._proposed
         if not belief.trusted and following.observer is not None:
-            following.observer.settle(fit.noise)  # no fit gives the state
+            following.observer.settle(place.noise)  # no fit gives the state
             return
         m, c_r, c_l = place.crossings.tolist()
         self._followed = replace(self.estimate, m=m, c_r=c_r, c_l=c_l)
         newer = self._record.since(belief.end)
-        following.go_on_from(place, np.array([newer.v, newer.y]), self._followed, fit.noise,
-                             belief.trusted)
+        following.go_on_from(place, np.array([newer.v, newer.y]), self._followed, belief.trusted)
 
     def _estimate_of(self, belief: Belief, known: Known) -> Estimate:
         values, e = self._setup.bounds.project(*known.crossings.tolist()), self.estimate

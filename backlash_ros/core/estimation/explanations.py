@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from math import inf, isnan, sqrt
+from math import exp, inf, isnan, log, sqrt
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from backlash_ros.core.estimation.fit import FEW_STEPS, FIRST_STEPS, NEAR, Probl
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.posterior import Prior, WindowFit, gap_variance
 from backlash_ros.core.estimation.search import search
-from backlash_ros.core.estimation.unmodelled import with_walk
+from backlash_ros.core.estimation.unmodelled import coasting_score, with_walk
 from backlash_ros.core.law import OutOfBounds
 from backlash_ros.core.parameters import Bounds
 from backlash_ros.core.plant.backlash import play
@@ -133,10 +133,10 @@ def afresh(
     fits = sorted((f for f in fits if np.isfinite(f.evidence)), key=lambda f: -f.evidence)
     different = [f for i, f in enumerate(fits) if all(
         abs(f.gap - g.gap) >= 0.1 * sqrt(max(float(g.cov[2, 2]), 0.0)) for g in fits[:i])]
-    likely = different[0].evidence - settings.FAR_BEHIND if different else inf
-    fits = [p.finished(p.fitted(f)) for f in different if f.evidence > likely]
-    if not fits:  # slopes of 0, or even the best one has diverged
+    if not different:  # slopes of 0, or even the best one has diverged
         return None
+    likely = different[0].evidence - settings.FAR_BEHIND
+    fits = [p.finished(p.fitted(f)) for f in different if f.evidence > likely]
     best = max(fits, key=lambda f: f.evidence)
     if best.m < 0.0 or (older is None and best.left.turns < setup.turns_needed):
         return best  # not known, however precise it is
@@ -145,16 +145,10 @@ def afresh(
 
 
 def mixed(p: Problem, best: WindowFit, others: Sequence[WindowFit] = ()) -> WindowFit:
-    """The likeliest of these fits and of others nearby, with the spread of the mixture.
-
-    If its G is incredible: the fit with G as told, if that leaves no more motion than friction and
-    compliance do, which xi then makes up for; else that fit adds to the spread.
-    """
-    told = best if best.credible else p.as_told(best)
-    # Motion of u that it leaves, but not the other fit.
-    more = sqrt(max(told.left.rms**2 - best.left.rms**2, 0.0)) / told.left.gain
-    if told is not best and told.valid and more < settings.NEGLIGIBLE * told.m * told.gap:
-        return mixed(p, told)
+    """The likeliest of these fits and of others nearby, with the spread of the mixture."""
+    rival, chance = _behind(p, best)
+    if chance > 0.5:
+        best, rival, chance, others = rival, best, 1.0 - chance, ()
     wider, beyond = _along_the_gap(p, best)
     # Only between fits that take readings in the same way can evidences be compared.
     alike_read = (f if bool(f.step) == bool(best.step) else p.finished(p.fitted(replace(
@@ -170,7 +164,28 @@ def mixed(p: Problem, best: WindowFit, others: Sequence[WindowFit] = ()) -> Wind
     share = np.exp(odds - odds.max(initial=-inf))
     for each, f in zip(share / share.sum(), fits, strict=True):
         wider += each * apart(f, best)
-    return replace(best, spread=wider + apart(told, best))
+    return replace(best, spread=wider + chance * apart(rival, best))
+
+
+def _behind(p: Problem, best: WindowFit) -> tuple[WindowFit, float]:
+    """The fit of a play behind G, which xi and a wrong gap can imitate, and its probability.
+
+    `best` and 0 if out of question: white residuals and a small xi, an integrator, coasting.
+    """
+    xi, k, left = float(np.linalg.norm(best.theta[3:])), p.family.count, best.left
+    white = not left.correlation and xi < settings.BY_CHANCE
+    if white or best.wiener or not best.valid or not xi or p.family.leaks:
+        return best, 0.0
+    with suppress(np.linalg.LinAlgError):
+        f = p.behind(best)
+        if f.valid and (f.left.rms < left.rms or coasting_score(p, best) < settings.BY_CHANCE):
+            # By the independent residuals, and by the priors of xi with the likeliest s.
+            odds = left.readings / best.inflation * log(max(f.left.rms, 1e-300) / left.rms)
+            for x, sign in ((xi, -1.0), (float(np.linalg.norm(f.theta[3:])), 1.0)):
+                s = max(x / sqrt(k), 1.0)
+                odds += sign * (0.5 * (x / s) ** 2 + k * log(s))
+            return f, 1.0 / (1.0 + exp(min(odds, 700.0)))
+    return best, 0.0
 
 
 def apart(one: WindowFit, other: WindowFit) -> Array:
@@ -242,7 +257,7 @@ def _with_gap(
 ) -> tuple[float, WindowFit]:
     """The highest log-posterior with this gap, and its fit, starting from a fit near it; other p0
     are only tried if it is not within `close` of `normal`."""
-    v, best, theta = float(p.v[0]), (-inf, near), near.theta.copy()
+    v, best, theta = float(p.at(near).v[0]), (-inf, near), near.theta.copy()
     theta[2] = gap
     # p0 may block the way to another gap: if it is unknown, also start from both of its ends.
     ends = [(0.0, True), (1.0, True)] * isnan(p.older.v)

@@ -1,6 +1,7 @@
 """Fits all unknowns to a record by Gauss-Newton steps with exact derivatives, one QR per step.
 
     y = G(z; xi) [m p(v; g, p0) - o + d] + X / A(z; xi) + e,   o = m c_r,   xi ~ N(0, s^2)
+    or, with the play behind G, G(1) [m p((G v + X / A) / G(1); g, p0) - o + d] + e (Wiener model)
 
 X: state of G before the record. p0, g: play output before it, and gap. d: disturbance of u, a walk
 that ends at 0. The noise is integrated out in closed form (Normal-Gamma), the scale s over a grid;
@@ -31,11 +32,14 @@ NEAR = 0.1, 0.3, 1.0, 1.0  # how far xi moves in the first steps, where the line
 
 
 class Run(NamedTuple):
-    """A record simulated with the values of a fit: G = b / a; play output p, then u and y, (N,).
+    """A record simulated with the values of a fit: input of the play v, its output p, u, y, (N,).
 
-    error: readings minus y (N,), 0 where lost. weights, number: see `quantized.independence`.
+    b, a: of G. gain: G(1) if the play is behind G, else 1. error: readings minus y (N,), 0 where
+    lost. weights, number: see `quantized.independence`.
     """
 
+    v: Array
+    gain: float
     b: list[float]
     a: list[float]
     p: Array
@@ -69,27 +73,20 @@ class Problem:
     def at(self, f: WindowFit) -> Run:
         """The record simulated with the values of this fit; the last three results are kept."""
         if f not in self._runs:
-            p = play(self.v, max(f.gap, 0.0), f.p0, self.strokes)
+            b, a = self.family.at(f.xi)
+            x, gain = padded(f.x, len(a) - 1), sum(b) / sum(a) if f.wiener else 1.0
+            v = lfilter(b, a, self.v, x) / gain if f.wiener else self.v
+            p = play(v, max(f.gap, 0.0), f.p0, strokes_of(v) if f.wiener else self.strokes)
             hats, knots, _ = self._walk_of(f)
             u = f.m * p - f.theta[1] + knots @ hats
-            b, a = self.family.at(f.xi)
-            y = lfilter(b, a, u, padded(f.x, len(a) - 1))
+            y = gain * u if f.wiener else lfilter(b, a, u, x)
             error = (self.y - y) * self.known
             weights, number = quantized.independence(
                 self.y, self.known, y, self.step_of_readings, inf if f.step else f.noise_std)
             likelihood = quantized.likelihood(error, f.noise_std, f.step, weights)
-            run = Run(b, a, p, u, y, error, likelihood, weights, number)
+            run = Run(v, gain, b, a, p, u, y, error, likelihood, weights, number)
             self._runs = dict([*self._runs.items(), (f, run)][-3:])
         return self._runs[f]
-
-    def holding(self, m: float, c_r: float, c_l: float) -> Problem:
-        """The same problem with this backlash, as if known to a millionth."""
-        gap = max(c_r - c_l, 1e-9 * float(np.ptp(self.v)))
-        known = 1e6 / np.array([m, m * gap, gap])
-        rows = np.vstack([self.older.rows, np.eye(3, 3 + self.family.count) * known[:, None]])
-        values = np.append(self.older.values, known * [m, m * c_r, gap])
-        return Problem(self.family, self.v, np.where(self.known, self.y, np.nan), self.nominal,
-                       self.older._replace(rows=rows, values=values), self.step_of_readings)
 
     def residual(self, f: WindowFit) -> Array:
         """Readings minus the simulated output (N,), nan where y was lost."""
@@ -151,7 +148,7 @@ class Problem:
         squares = float(r[size, size]) ** 2 + (self.nominal / f.noise_std) ** 2
         xi, cov_xi, scale, volume, noise = posterior.error_of_plant(f, r[n:, n:], squares, freedom)
         beta = of_eta @ r[:n, -1] + of_xi @ xi
-        swing, first = float(np.ptp(self.v)), float(self.v[0])
+        swing, first = float(np.ptp(self.v)), float(run.v[0])
         # With a gap of exactly 0, both sides would be engaged at once.
         beta[at + 2] = gap = min(max(beta[at + 2], 1e-9 * swing), 2.0 * swing)
         p0 = float(beta[at - 1])
@@ -178,7 +175,7 @@ class Problem:
         """Least-squares rows of a step: N samples, B priors; target last, (N + B, P + 1)."""
         vague = 100.0  # prior standard deviation of X, over the largest reading
         tight = 1e6  # weight by which an unknown keeps its value
-        run, jacobian, first = self.at(f), self.jacobian(f), self.v[0]
+        run, jacobian, first = self.at(f), self.jacobian(f), self.at(f).v[0]
         _, score, information = run.likelihood
         (_, knots, knot_std), x = self._walk_of(f), padded(f.x, len(run.a) - 1)
         beta = np.concatenate([x, knots, [f.p0], f.theta])
@@ -193,8 +190,7 @@ class Problem:
         beside = [
             # Weak priors: a gap of the size of the swing of v, p0 anywhere in the present gap.
             tight * (gap + f.gap * target) if held else gap / max(float(np.ptp(self.v)), 1e-300),
-            tight * (p0 + f.p0 * target) if begun else begin,
-            *unit[at + 3:at + 3 + self._leaks],
+            tight * (p0 + f.p0 * target) if begun else begin, *unit[at + 3:at + 3 + self._leaks],
             *((row + x * target) / reach for row, x in near),
             # Keeps X finite where no reading determines it, as when the first ones were lost.
             *(row / (vague * max(float(np.abs(self.y).max()), 1e-300)) for row in unit[:len(x)]),
@@ -204,16 +200,21 @@ class Problem:
 
     def jacobian(self, f: WindowFit) -> Array:
         """Derivatives of the simulated y by X, knots, p0, m, o, g and xi, in this order: (N, P)."""
-        run, count = self.at(f), len(self.v)
-        side = engaged(self.v, run.p, max(f.gap, 0.0))
+        run, count, gap = self.at(f), len(self.v), max(f.gap, 0.0)
+        side, order = engaged(run.v, run.p, gap), len(run.a) - 1
         # Until p first moves it is p0, whichever side is engaged.
         side[:int(np.argmax(np.append(run.p != f.p0, True)))] = Region.GAP
-        over_a = lfilter([1.0], run.a, np.vstack([
-            self._walk_of(f)[0], f.m * (side == Region.GAP), run.p, np.full(count, -1.0),
-            f.m * (side == Region.LEFT), run.u, run.y, np.eye(1, count)]))
-        *_, u, y, impulse = over_a
-        return np.vstack([shifted(impulse, len(run.a) - 1), lfilter(run.b, [1.0], over_a[:-3]),
-                          sensitivities(self.family, f.xi, u, y)]).T
+        of_play = np.vstack([self._walk_of(f)[0], f.m * (side == Region.GAP), run.p,
+                             np.full(count, -1.0), f.m * (side == Region.LEFT)])
+        of_play = run.gain * of_play if f.wiener else lfilter(run.b, run.a, of_play)
+        into, out = (self.v, run.gain * run.v) if f.wiener else (run.u, run.y)  # of G
+        u, y, impulse = lfilter([1.0], run.a, np.vstack([into, out, np.eye(1, count)]))
+        of_plant = np.vstack([shifted(impulse, order), sensitivities(self.family, f.xi, u, y)])
+        if f.wiener:  # p moves with its input, but not within the gap
+            moves = (run.p == run.v) | (run.p == run.v + gap)
+            newest = np.maximum.accumulate(np.where(moves, np.arange(count), -1))
+            of_plant = f.m * np.where(newest < 0, 0.0, of_plant[:, newest])
+        return np.vstack([of_plant[:order], of_play, of_plant[order:]]).T
 
     def fitted(self, f: WindowFit, steps: int = STEPS, least_gain: float = 0.0) -> WindowFit:
         """Take Gauss-Newton steps from f until they converge or gain under `least_gain` nats."""
@@ -273,13 +274,11 @@ class Problem:
 
     def towards(self, f: WindowFit, new: WindowFit, share: float = 1.0) -> WindowFit:
         """The fit at this share of the way from f to new, or beyond it."""
-        furthest = float(np.abs(new.theta[3:] - f.theta[3:]).max(initial=0.0))
-        length = share * (2.0 / max(furthest, 2.0))  # xi: two prior deviations a step, at most
         order, knots = max(len(f.x), len(new.x)), self._walk_of(f)[1]
         old, x = padded(f.x, order), padded(new.x, order)
-        return replace(
-            new, x=old + length * (x - old), knots=knots + length * (new.knots - knots),
-            p0=f.p0 + length * (new.p0 - f.p0), theta=f.theta + length * (new.theta - f.theta))
+        return replace(new, x=old + share * (x - old), knots=knots + share * (new.knots - knots),
+                       p0=f.p0 + share * (new.p0 - f.p0),
+                       theta=f.theta + share * (new.theta - f.theta))
 
     def _with_noise(self, f: WindowFit) -> WindowFit:
         """This fit with the noise_std that its residuals show."""
@@ -293,29 +292,31 @@ class Problem:
 
     def finished(self, f: WindowFit) -> WindowFit:
         """This fit with `left`, the statistics of its residuals and reversals, filled in."""
-        run, known = self.at(f), self.known
+        run = self.at(f)
         w, count = run.weights, float(run.weights.sum())
         density, score, information = run.likelihood
-        e = np.bincount(run.number, (score * w)[known])  # one score per independent reading
-        squares = max(float(e @ e), 1e-300)
-        rho = max(float(e[lag:] @ e[:-lag]) / squares for lag in (1, 2, 4, 8) if lag < len(e))
-        told = max(float(w @ information), 1e-300)
-        dispersion = squares / told  # below 1, rho is unreliable
+        e = np.bincount(run.number, (score * w)[self.known])  # one score per independent reading
+        squares, expected = max(float(e @ e), 1e-300), max(float(w @ information), 1e-300)
+        rho = max(float(e[lag:] @ e[:-lag]) / squares for lag in (1, 2, 4, 8))
+        dispersion = squares / expected  # below 1, rho is unreliable
         rho = max(rho - 3.0 / sqrt(max(count, 1.0)), 0.0) * min(dispersion, 1.0)
-        near = told * f.noise_std**2  # readings near an edge of their interval; unknowns take some
+        near = expected * f.noise_std**2  # readings near an edge; unknowns take some
         dispersion *= near / max(near - len(f.x) - 1.0 - len(f.theta), 1.0)
         # Scaled so that merely counting more or fewer readings makes no fit likelier.
         value = float(w @ density) + count * log(self.step_of_readings or self.nominal)
-        turns = len(reversals(engaged(self.v, run.p, max(f.gap, 0.0))))
-        rms = sqrt(float(run.error @ run.error) / max(int(known.sum()), 1))
+        turns = len(reversals(engaged(run.v, run.p, max(f.gap, 0.0))))
+        rms = sqrt(float(run.error @ run.error) / max(int(self.known.sum()), 1))
         gain = max(float(np.std(run.y)), 1e-300) / max(float(np.std(run.u)), 1e-300)
         return replace(f, left=posterior.Left(
             value, rms, rho, dispersion if f.step else 1.0, count, turns, gain))
 
     def begun(self, f: WindowFit, offset: bool = False) -> WindowFit:
         """This fit with X, `offset`: o and d, too, by linear least squares; f if y overflows."""
-        there = replace(f, x=np.zeros(1), step=0.0)  # far from the intervals
-        run, (hats, knots, _) = self.at(there), self._walk_of(f)
+        if f.wiener:  # y is not linear in X: if there is none yet, G was at rest
+            b, a = map(np.array, self.family.at(f.xi))
+            rest = self.v[0] * np.cumsum((b - a * b.sum() / a.sum())[:0:-1])[::-1]
+            return f if f.x.any() else replace(f, x=rest)
+        run, (hats, knots, _) = self.at(replace(f, x=np.zeros(1), step=0.0)), self._walk_of(f)
         columns = [*numerics.state_responses(run.a, len(self.v))]
         if offset:
             of_u = np.vstack([*hats, np.full(len(self.v), -1.0)])
@@ -329,10 +330,12 @@ class Problem:
             theta[1], knots = theta[1] + best[-1], knots + best[n:-1]
         return replace(f, x=best[:n], knots=knots, theta=theta)
 
-    def as_told(self, f: WindowFit) -> WindowFit:
-        """A finished fit from there, with G as told."""
-        begin = replace(f.without_intervals(0.0), theta=np.append(f.theta[:3], 0.0 * f.theta[3:]))
-        return self.finished(self.fitted(self.begun(replace(begin, told=True), offset=True)))
+    def behind(self, f: WindowFit) -> WindowFit:
+        """A finished fit with the play behind G, as told unless another G leaves only noise."""
+        begin = self.begun(replace(f.without_intervals(f.walk_std), x=np.zeros(1), wiener=True,
+                                   theta=np.append(f.theta[:3], 0.0 * f.theta[3:])))
+        told, free = replace(begin, told=True), self.finished(self.fitted(begin))
+        return self.finished(self.fitted(told)) if free.left.correlation else free
 
     def with_intervals(self, f: WindowFit) -> WindowFit:
         """The finished fit, by the interval likelihood unless noise hides the quantization."""
@@ -342,7 +345,7 @@ class Problem:
         largest = 0.25 * step
         edges = unknowns / max(float(self.at(f).weights.sum()), 1.0)
         least = min(step * max(1.0 / 64.0, edges), largest)
-        if not step or f.told or f.m <= 0.0 or (not f.step and f.noise_std > 0.75 * step):
+        if not step or f.wiener or f.m <= 0.0 or (not f.step and f.noise_std > 0.75 * step):
             return self.finished(f)
 
         def at(level: float, begin: WindowFit) -> WindowFit:

@@ -142,7 +142,7 @@ def likelier(
 
     already: samples swapped so far. Returns the record and all samples that are swapped in it.
     """
-    if not record.between(since).is_open or fit.m <= 0.0:
+    if not record.between(since).is_open or fit.m <= 0.0 or fit.wiener:
         return record, already
     intervals = OpenIntervals(setup, record, fit, already, older, since)
     acting, newest = intervals.start, intervals.newest

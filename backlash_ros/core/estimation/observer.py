@@ -82,7 +82,7 @@ class Observer:
 
 class Place(NamedTuple):
     """Where a fit ends: p, and x of `model` in observer form; u, y of its newest samples (M,).
-    crossings: m, c_r, c_l (3,) to go on with."""
+    crossings: m, c_r, c_l (3,) to go on with. noise: standard deviation of y."""
 
     p: float
     u: Array
@@ -90,6 +90,7 @@ class Place(NamedTuple):
     model: TransferFunction
     x: Array
     crossings: Array
+    noise: float
 
 
 class Following:
@@ -156,17 +157,15 @@ class Following:
         self.since_v_moved = self.since_v_moved + 1 if self._v == v else 0
         self._v = v
 
-    def go_on_from(
-        self, place: Place, newer: Array, estimate: Estimate, noise_std: float, known: bool,
-    ) -> None:
+    def go_on_from(self, place: Place, newer: Array, estimate: Estimate, known: bool) -> None:
         """Set play and observer to where a fit ended, then advance them by newer v, y (2, M).
 
         known: whether to trust the state of the fit more than newer samples.
         """
         if not place.model.equals(self.model.transfer_function):
             return  # another G was adopted meanwhile
-        self.observer = observer = self.observer or Observer(self.model, noise_std, self._gains)
-        observer.settle(noise_std)
+        self.observer = observer = self.observer or Observer(self.model, place.noise, self._gains)
+        observer.settle(place.noise)
         observer.place(place.x, known)
         v, y = newer
         p = np.append(place.p, play(v, estimate.c_r - estimate.c_l, place.p) if len(v) else v)

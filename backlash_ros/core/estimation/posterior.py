@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from math import exp, inf, nan, sqrt
+from math import inf, nan, sqrt
 from typing import NamedTuple
 
 import numpy as np
 
-from backlash_ros.core.estimation.settings import BY_CHANCE, CHANCE
+from backlash_ros.core.estimation.settings import CHANCE
 from backlash_ros.core.plant.numerics import agree
 from backlash_ros.core.plant.transfer_function import Array
 
@@ -48,7 +48,8 @@ class WindowFit:
     walk_std: float = 0.0  # of u per square root of a sample, 0: no walk
     step: float = 0.0  # quantization step if readings are taken as intervals, else 0
     scale: float = 1.0  # most probable s
-    told: bool = False  # whether G is taken as told, with xi = 0
+    wiener: bool = False  # whether the play is behind G
+    told: bool = False  # whether G is taken as told, xi = 0
     cov: Array = field(default_factory=lambda: np.zeros((0, 0)))  # of theta, if residuals are white
     volume: float = 0.0  # log volume of the posterior (Occam factor)
     spread: Array = field(default_factory=lambda: np.zeros(()))  # of m, c_r, c_l, xi by other gaps
@@ -133,11 +134,6 @@ class WindowFit:
         rounding = 1.1 * self.step / sqrt(12.0)
         return self.left.readings * self.left.correlation > 1.0 and self.left.rms > rounding
 
-    @property
-    def credible(self) -> bool:
-        """Whether G need not be more wrong than its prior allows, by which ln s is 0 +- 1."""
-        return float(np.linalg.norm(self.theta[3:])) < exp(BY_CHANCE)
-
     def without_intervals(self, walk_std: float) -> WindowFit:
         """The same values with quantization as a part of normal noise, spread and d forgotten."""
         return replace(self, step=0.0, noise_std=self.noise, walk_std=walk_std, knots=np.zeros(0),
@@ -163,7 +159,7 @@ def error_of_plant(
     if not k:
         return np.zeros(0), np.zeros((0, 0)), f.scale, 0.0, variance
     u, singular, vt = np.linalg.svd(r[:k, :k])
-    z, scales = u.T @ r[:k, k], SCALES[:1 if f.told else None][:, None]
+    z, scales = u.T @ r[:k, k], SCALES[:1 if f.told else None, None]
     noise, seen, power = np.full((len(scales), 1), variance), (scales * singular) ** 2, z**2
     for _ in range(1 if f.step else 4):  # noise and shrinkage depend on each other
         shrink = 1.0 / (1.0 + seen / noise)

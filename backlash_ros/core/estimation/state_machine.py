@@ -97,8 +97,7 @@ def _searching(setup: Setup, record: Window, before: Belief) -> Belief:
                             found=None, reason=why, coasts=False)
     if found is None:
         return after
-    known = before.published and before.published.crossings
-    if coasts(setup.problem(part), found, known):
+    if coasts(setup.problem(part), found):
         after = after._replace(coasts=True, reason=Status.INCONSISTENT)
     after = after._replace(kept=before.kept._replace(swapped=swapped), found=found)
     if not setup.is_known(found):
@@ -184,15 +183,14 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
         change = int(np.argmax(np.cumsum(beyond[::-1])[::-1]))
         # Samples that contradict one explanation after another come from no backlash.
         must = min(2 * trial.must, settings.MOST_PREDICTED) if lately else PREDICTED
-        return before._replace(
-            end=record.end, found=None, trial=trial._replace(must=must),
-            doubt_from=record.first + new + change, next_at=record.end + FEWEST,
-            reason=Status.INCONSISTENT if lately else before.reason)
+        return before._replace(end=record.end, found=None, trial=trial._replace(must=must),
+                               doubt_from=record.first + new + change, next_at=record.end + FEWEST,
+                               reason=Status.INCONSISTENT if lately else before.reason)
     # Look again soon after an early fit: what caused the surprise may have only just begun.
     soon = FEWEST if record.end < before.next_at else max(count // BLOCKS, FEWEST)
     trial = trial._replace(predicted=trial.predicted + count - new)
     after = before._replace(end=record.end, next_at=record.end + soon, trial=trial)
-    if record.end >= before.thorough[0] or fit.cov[2, 2] < before.thorough[1] or not fit.credible:
+    if record.end >= before.thorough[0] or fit.cov[2, 2] < before.thorough[1]:
         fit = problem.with_intervals(fit)
         if count <= SHORT_RECORD and isnan(problem.older.v):
             other = afresh(setup, record, fit, kept.older, fit)
@@ -201,7 +199,7 @@ def _known(setup: Setup, record: Window, before: Belief) -> Belief:
             record, fit, swapped = weighed(setup, record, fit, kept.swapped, kept.older)
             problem = setup.problem(record, kept.older)
             after = after._replace(kept=kept._replace(swapped=swapped))
-        elif fit.step or fit.spread.any() or not fit.credible:  # else the posterior is normal
+        elif fit.step or fit.spread.any():  # else the posterior is normal
             fit = mixed(problem, fit)
         fit = with_walk(problem, fit, setup.walk_std)
         after = after._replace(thorough=(record.end + 2 * count // 5, 0.25 * float(fit.cov[2, 2])))
@@ -310,10 +308,8 @@ def _beside_inherited(setup: Setup, belief: Belief, fit: WindowFit, known: Known
         prior = prior + settings.LOST_MOTION**2 * np.diag(size**2 / [4.0, 2.0, 2.0])
     alike, another = cov + prior, cov + prior + np.diag(size**2)
     if not agree(fit.crossings, known.crossings, alike, settings.CHANCE):
-        # A gear that is not pure play leaves systematic residuals, or takes G beyond all that its
-        # prior allows, which refutes nothing.
-        white = fit.credible and not (fit.systematic or fit.told)
-        sure = white and fit.left.turns >= settings.HELD_REVERSALS and \
+        # A gear that is not pure play leaves systematic residuals, which refute nothing.
+        sure = not fit.systematic and fit.left.turns >= settings.HELD_REVERSALS and \
             posterior.gap_variance(cov) < (replacing * fit.gap) ** 2
         if sure and belief.trial.predicted >= belief.trial.must:
             belief = belief._replace(inherited=None)  # it belonged to another plant

@@ -18,28 +18,25 @@ from backlash_ros.core.plant.numerics import basis, lfilter
 from backlash_ros.core.plant.transfer_function import Array
 
 
-def coasts(problem: Problem, fit: WindowFit, known: Array | None = None) -> bool:
-    """Whether residuals are correlated because the load coasts within the gap.
-
-    known: earlier m, c_r, c_l (3,), tested as well: with coasting, a fit may find next to no gap.
-    """
+def coasts(problem: Problem, fit: WindowFit) -> bool:
+    """Whether residuals are correlated because the load coasts within the gap."""
     named = 8.0  # least kappa over its standard deviation; high, as residuals are far from white
     matters = 2e-3  # least unexplained motion over the gap; quantization of slow motion leaves less
     if not (fit.m > 0.0 and fit.left.turns and fit.systematic and fit.unexplained > matters):
         return False
-    tested = [fit] if known is None else [fit, as_known(problem, known, fit)]
-    return any(_coasting_score(problem, f) > named for f in tested)
+    before = as_known(problem, fit.crossings, fit) if fit.wiener else fit
+    return coasting_score(problem, before) > named
 
 
 def as_known(problem: Problem, known: Array, fit: WindowFit) -> WindowFit:
-    """The fit with earlier m, c_r, c_l (3,) in place of its own."""
+    """The fit with these m, c_r, c_l (3,) in place of its own, of a play before G."""
     m, c_r, c_l = known.tolist()
     theta = np.concatenate([[m, m * c_r, c_r - c_l], fit.theta[3:]])
     p0 = float(problem.v[0]) + 0.5 * (c_r - c_l)
-    return problem.finished(problem.begun(replace(fit, theta=theta, p0=p0)))
+    return problem.finished(problem.begun(replace(fit, theta=theta, p0=p0, wiener=False)))
 
 
-def _coasting_score(problem: Problem, fit: WindowFit) -> float:
+def coasting_score(problem: Problem, fit: WindowFit) -> float:
     """kappa over its standard deviation for white residuals; 0 for a small kappa."""
     v, p = problem.v, problem.at(fit).p
     beyond, speed = [0.0], 0.0  # distance of a load that coasts freely from p
@@ -63,14 +60,13 @@ def with_walk(problem: Problem, f: WindowFit, least: float) -> WindowFit:
     """The fit, or one with a larger random walk of u if that explains correlated residuals."""
     begin = f.without_intervals(least)
     best = f if f.walk_std == least else problem.with_intervals(problem.fitted(begin))
-    if f.told or not best.valid or not best.systematic:  # friction and compliance are no walk
+    if f.wiener or not best.valid or not best.systematic:  # friction and compliance are no walk
         return best
-    seems_to_coast = _coasting_score(problem, best) > settings.BY_CHANCE
+    seems_to_coast = coasting_score(problem, best) > settings.BY_CHANCE
     for share in (0.005, 0.02, 0.08):  # walk over the record, in units of m times the gap
-        walk_std = share * f.m * f.gap / sqrt(len(problem.v))
-        if walk_std > least:
-            walks = replace(begin, walk_std=walk_std)
-            g = problem.with_intervals(problem.fitted(walks, FIRST_STEPS))
+        std = share * f.m * f.gap / sqrt(len(problem.v))
+        if std > least:
+            g = problem.with_intervals(problem.fitted(replace(begin, walk_std=std), FIRST_STEPS))
             needed = 0.0 if best.walk_std > least else settings.FAR_BEHIND
             # Fewer independent residuals: those of a first-order process; if a load coasts, one.
             rho = min(g.left.correlation, 0.999)

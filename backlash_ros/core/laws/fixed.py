@@ -38,11 +38,12 @@ class FixedBacklash(Law):
         self._rows: list[list[float]] = self._transition.tolist()
         self._noise_std, self._noise = max(noise_std, 1e-12), NoiseLevel()
         self._x, self._u, self._started = [0.0] * (n + 1), 0.0, False
-        # Covariances of x (n + 1, n + 1): after the newest sample and, without the change of d,
-        # before the next one. They do not depend on y(k).
-        self._p: Array = np.zeros((n + 1, n + 1))
-        self._p_ahead = self._p.copy()
-        # Change of d, and whether y came, of the newest sample; None: they are in _p.
+        # Roots S of covariances S'S of x (n + 1, n + 1): after the newest sample and, without the
+        # change of d, before the next one. They do not depend on y(k), and keep the covariance
+        # positive however wide the prior is beside the noise.
+        self._root: Array = np.zeros((n + 1, n + 1))
+        self._root_ahead = self._root.copy()
+        # Change of d, and whether y came, of the newest sample; None: they are in _root.
         self._newest: tuple[float, bool] | None = None
         self._look_ahead()
 
@@ -65,7 +66,7 @@ class FixedBacklash(Law):
     @property
     def x_cov(self) -> Array:
         self.prepare()
-        return self._p[:-1, :-1]
+        return np.asarray(self._root.T @ self._root)[:-1, :-1]
 
     def predicted(self, u: float) -> float:
         """Prediction of y(k+1) if the backlash puts out this u."""
@@ -82,7 +83,7 @@ class FixedBacklash(Law):
             if not self._started:
                 # A prior that is wide compared with the first output and the noise.
                 wide = 1e3 * (abs(y) + self._noise_var**0.5)
-                self._p_ahead[:-1, :-1] += wide**2 * np.eye(len(x) - 1)
+                self._root_ahead = _root_of(self._root_ahead, wide * np.eye(len(x) - 1, len(x)))
                 self._started = True
                 self._look_ahead()
             self.innovation = innovation = y - self._c * x[0]
@@ -93,20 +94,22 @@ class FixedBacklash(Law):
     def prepare(self) -> None:
         if self._newest is None:
             return
-        (change, heard), self._newest, p = self._newest, None, self._p_ahead
-        p[-1, -1] += change**2
-        if heard:
-            # In Joseph's form, which stays positive however wide the prior is beside the noise.
-            kept, gain = np.eye(len(p)), np.array(self._gain)
-            kept[:, 0] -= self._c * gain
-            p = kept @ p @ kept.T + self._noise_var * np.outer(gain, gain)
+        (change, heard), self._newest, size = self._newest, None, len(self._x)
+        root = _root_of(self._root_ahead, change * np.eye(1, size, size - 1))
+        if heard:  # the array form of a Kalman filter: y and x, given y
+            of_y = self._noise_var**0.5 * np.eye(1, size + 1)
+            root = _root_of(of_y, np.column_stack([self._c * root[:, 0], root]))[1:, 1:]
             self._noise.take(self.innovation)
-        self._p = 0.5 * (p + p.T)
-        self._p_ahead = self._transition @ self._p @ self._transition.T
+        self._root, self._root_ahead = root, root @ self._transition.T
         self._look_ahead()
 
     def _look_ahead(self) -> None:
         """Compute the gain for the next sample, and x then, but for u and y: lists, as above."""
-        cross = self._c * self._p_ahead[:, 0]
+        cross = self._c * self._root_ahead.T @ self._root_ahead[:, 0]
         self._gain: list[float] = (cross / (self._c * cross[0] + self._noise_var)).tolist()
         self._x_ahead = [dot(row, self._x) for row in self._rows]
+
+
+def _root_of(*rows: Array) -> Array:
+    """A root (n, n) of the sum of the covariances that these have as rows of roots, each (m, n)."""
+    return np.asarray(np.linalg.qr(np.vstack(rows), mode='r'))
