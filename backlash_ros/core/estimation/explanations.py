@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from math import exp, inf, isnan, log, sqrt
+from math import exp, inf, isnan, sqrt
 
 import numpy as np
 
@@ -172,19 +172,13 @@ def _behind(p: Problem, best: WindowFit) -> tuple[WindowFit, float]:
 
     `best` and 0 if out of question: white residuals and a small xi, an integrator, coasting.
     """
-    xi, k, left = float(np.linalg.norm(best.theta[3:])), p.family.count, best.left
-    white = not left.correlation and xi < settings.BY_CHANCE
-    if white or best.wiener or not best.valid or not xi or p.family.leaks:
+    white = not best.left.correlation and np.linalg.norm(best.theta[3:]) < settings.BY_CHANCE
+    if white or best.wiener or not best.valid or p.family.leaks or not p.family.count:
         return best, 0.0
     with suppress(np.linalg.LinAlgError):
         f = p.behind(best)
-        if f.valid and (f.left.rms < left.rms or coasting_score(p, best) < settings.BY_CHANCE):
-            # By the independent residuals, and by the priors of xi with the likeliest s.
-            odds = left.readings / best.inflation * log(max(f.left.rms, 1e-300) / left.rms)
-            for x, sign in ((xi, -1.0), (float(np.linalg.norm(f.theta[3:])), 1.0)):
-                s = max(x / sqrt(k), 1.0)
-                odds += sign * (0.5 * (x / s) ** 2 + k * log(s))
-            return f, 1.0 / (1.0 + exp(min(odds, 700.0)))
+        if f.valid and (f.left.rms < best.left.rms or coasting_score(p, best) < settings.BY_CHANCE):
+            return f, 1.0 / (1.0 + exp(min(best.odds_over(f), 700.0)))
     return best, 0.0
 
 

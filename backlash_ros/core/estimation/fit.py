@@ -305,7 +305,7 @@ class Problem:
         # Scaled so that merely counting more or fewer readings makes no fit likelier.
         value = float(w @ density) + count * log(self.step_of_readings or self.nominal)
         turns = len(reversals(engaged(run.v, run.p, max(f.gap, 0.0))))
-        rms = sqrt(float(run.error @ run.error) / max(int(self.known.sum()), 1))
+        rms = sqrt(float(run.error @ run.error) / max(int(self.known.sum()), 1) + 1e-300)
         gain = max(float(np.std(run.y)), 1e-300) / max(float(np.std(run.u)), 1e-300)
         return replace(f, left=posterior.Left(
             value, rms, rho, dispersion if f.step else 1.0, count, turns, gain))
@@ -331,19 +331,18 @@ class Problem:
         return replace(f, x=best[:n], knots=knots, theta=theta)
 
     def behind(self, f: WindowFit) -> WindowFit:
-        """A finished fit with the play behind G, as told unless another G leaves only noise."""
+        """A finished fit with the play behind G, as told unless another G is likelier."""
         begin = self.begun(replace(f.without_intervals(f.walk_std), x=np.zeros(1), wiener=True,
                                    theta=np.append(f.theta[:3], 0.0 * f.theta[3:])))
-        told, free = replace(begin, told=True), self.finished(self.fitted(begin))
-        return self.finished(self.fitted(told)) if free.left.correlation else free
+        free, told = (self.finished(self.fitted(g)) for g in (begin, replace(begin, told=True)))
+        return told if free.odds_over(told) < 0.0 else free
 
     def with_intervals(self, f: WindowFit) -> WindowFit:
         """The finished fit, by the interval likelihood unless noise hides the quantization."""
         # noise_std is the likeliest of a grid, but large enough that there is a reading near an
         # edge of its interval for every unknown: with fewer, the posterior would not be normal.
         step, unknowns = self.step_of_readings, len(f.x) + len(f.knots) + 1 + len(f.theta)
-        largest = 0.25 * step
-        edges = unknowns / max(float(self.at(f).weights.sum()), 1.0)
+        largest, edges = 0.25 * step, unknowns / max(float(self.at(f).weights.sum()), 1.0)
         least = min(step * max(1.0 / 64.0, edges), largest)
         if not step or f.wiener or f.m <= 0.0 or (not f.step and f.noise_std > 0.75 * step):
             return self.finished(f)

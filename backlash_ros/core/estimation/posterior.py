@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from math import inf, nan, sqrt
+from math import inf, log, nan, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -87,6 +87,13 @@ class WindowFit:
         """Its posterior of xi alone, as the prior of another fit."""
         root = np.linalg.inv(np.linalg.cholesky(self.cov_xi + 1e-12 * np.eye(len(self.cov_xi))))
         return Prior(np.hstack([np.zeros((len(root), 3)), root]), root @ self.theta[3:])
+
+    def odds_over(self, other: WindowFit) -> float:
+        """Log-odds, by the independent residuals and the priors of xi with the likeliest s >= 1."""
+        k = max(len(self.theta) - 3, 1)
+        sizes = (float(np.linalg.norm(f.theta[3:])) / sqrt(k) for f in (self, other))
+        own, its = (0.5 * k * min(x, 1.0) ** 2 + k * log(max(x, 1.0)) for x in sizes)
+        return its - own + self.left.readings / self.inflation * log(other.left.rms / self.left.rms)
 
     def behind(self, xi: Array) -> float:
         """Log-likelihood by which another xi (K,) is worse than that of this fit."""

@@ -95,12 +95,13 @@ class FixedBacklash(Law):
         if self._newest is None:
             return
         (change, heard), self._newest, size = self._newest, None, len(self._x)
-        root = _root_of(self._root_ahead, change * np.eye(1, size, size - 1))
-        if heard:  # the array form of a Kalman filter: y and x, given y
+        root = np.vstack([self._root_ahead, change * np.eye(1, size, size - 1)])
+        if heard:  # the array form of a Kalman filter: y and x, then x given y
             of_y = self._noise_var**0.5 * np.eye(1, size + 1)
-            root = _root_of(of_y, np.column_stack([self._c * root[:, 0], root]))[1:, 1:]
+            root = _root_of(np.column_stack([self._c * root[:, 0], root]), of_y)[1:, 1:]
             self._noise.take(self.innovation)
-        self._root, self._root_ahead = root, root @ self._transition.T
+        self._root = root if heard else _root_of(root)
+        self._root_ahead = self._root @ self._transition.T
         self._look_ahead()
 
     def _look_ahead(self) -> None:
