@@ -3,6 +3,7 @@
 Moving-horizon estimation (C. V. Rao et al., IEEE Trans. Automatic Control 48 (2003) 246-258).
 """
 
+from contextlib import suppress
 from dataclasses import replace
 from math import hypot, nan
 from typing import NamedTuple
@@ -14,6 +15,7 @@ from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.estimation import settings
 from backlash_ros.core.estimation.belief import Belief, Kept, Known
 from backlash_ros.core.estimation.explanations import Setup
+from backlash_ros.core.estimation.fit import FEW_STEPS
 from backlash_ros.core.estimation.observer import Following, Place
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.state_machine import learn
@@ -57,13 +59,19 @@ def fitted(
     if fit is None or belief.published is None:
         return Fitted(belief)
     part = record.swapped(kept.swapped ^ before.kept.swapped).between(kept.first, belief.end)
-    problem, known = setup.problem(part, kept.older), belief.published
-    if belief.inherited is not None or fit.wiener:
-        fit = as_known(problem, known.crossings if belief.inherited else fit.crossings, fit)
+    problem, crossings, noise = setup.problem(part, kept.older), fit.crossings, fit.noise
+    if belief.inherited is not None:
+        crossings = belief.published.crossings
+        if not fit.systematic:  # holding it improves x and xi, unless they absorb friction
+            problem = problem.holding(*crossings.tolist())
+            with suppress(np.linalg.LinAlgError):
+                fit = problem.fitted(fit, FEW_STEPS)
+    if fit.wiener:
+        fit = as_known(problem, crossings, fit)
+        noise = fit.left.rms
     run, last = problem.at(fit), min(len(part.v), 4 * setup.family.memory, settings.ROWS)
     u, y = run.u[-last:], part.y[-last:]
-    place = Place(float(run.p[-1]), u, y, model, state_after(model, u, y), fit.crossings,
-                  max(fit.noise, fit.left.rms))
+    place = Place(float(run.p[-1]), u, y, model, state_after(model, u, y), crossings, noise)
     if not len(proposed) or not belief.trusted or fit.behind(proposed) <= 1.0:
         return Fitted(belief, place)
     better = StateModel(setup.family.model_at(fit.xi))

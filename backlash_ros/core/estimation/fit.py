@@ -88,6 +88,15 @@ class Problem:
             self._runs = dict([*self._runs.items(), (f, run)][-3:])
         return self._runs[f]
 
+    def holding(self, m: float, c_r: float, c_l: float) -> Problem:
+        """The same problem with this backlash, as if known to a millionth."""
+        gap, older = max(c_r - c_l, 1e-9 * float(np.ptp(self.v))), self.older
+        known = 1e6 / np.array([m, m * gap, gap])
+        rows = np.vstack([older.rows, np.eye(3, 3 + self.family.count) * known[:, None]])
+        older = older._replace(rows=rows, values=np.append(older.values, known * [m, m * c_r, gap]))
+        return Problem(self.family, self.v, np.where(self.known, self.y, np.nan), self.nominal,
+                       older, self.step_of_readings)
+
     def residual(self, f: WindowFit) -> Array:
         """Readings minus the simulated output (N,), nan where y was lost."""
         return np.where(self.known, self.at(f).error, np.nan)
@@ -274,6 +283,8 @@ class Problem:
 
     def towards(self, f: WindowFit, new: WindowFit, share: float = 1.0) -> WindowFit:
         """The fit at this share of the way from f to new, or beyond it."""
+        furthest = float(np.abs(new.theta[3:] - f.theta[3:]).max(initial=0.0))
+        share *= 2.0 / max(furthest, 2.0)  # xi: two prior deviations a step, at most
         order, knots = max(len(f.x), len(new.x)), self._walk_of(f)[1]
         old, x = padded(f.x, order), padded(new.x, order)
         return replace(new, x=old + share * (x - old), knots=knots + share * (new.knots - knots),
@@ -313,9 +324,8 @@ class Problem:
     def begun(self, f: WindowFit, offset: bool = False) -> WindowFit:
         """This fit with X, `offset`: o and d, too, by linear least squares; f if y overflows."""
         if f.wiener:  # y is not linear in X: if there is none yet, G was at rest
-            b, a = map(np.array, self.family.at(f.xi))
-            rest = self.v[0] * np.cumsum((b - a * b.sum() / a.sum())[:0:-1])[::-1]
-            return f if f.x.any() else replace(f, x=rest)
+            return f if f.x.any() else replace(
+                f, x=self.v[0] * numerics.rest_of(*self.family.at(f.xi)))
         run, (hats, knots, _) = self.at(replace(f, x=np.zeros(1), step=0.0)), self._walk_of(f)
         columns = [*numerics.state_responses(run.a, len(self.v))]
         if offset:

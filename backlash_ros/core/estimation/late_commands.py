@@ -9,7 +9,7 @@ commands soon after each other look like one between them, pairs are compared, t
 
 from collections.abc import Sequence
 from dataclasses import replace
-from math import exp, inf, lgamma, sqrt
+from math import exp, inf, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +19,7 @@ from backlash_ros.core.estimation import settings
 from backlash_ros.core.estimation.explanations import Setup, afresh, apart
 from backlash_ros.core.estimation.posterior import Prior, WindowFit
 from backlash_ros.core.plant.backlash import play
-from backlash_ros.core.plant.numerics import basis, lfilter
+from backlash_ros.core.plant.numerics import basis, lfilter, log_jeffreys
 from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.window import Window
 
@@ -131,7 +131,7 @@ class OpenIntervals:
     def _prior_of(self, acting: Acting, more: int = 0) -> float:
         """Its log-prior with so many more commands swapped."""
         late = self._settled + int(acting.swapped.sum()) + more
-        return _log_prior(max(late, 0), self._count)
+        return log_jeffreys(max(late, 0), self._count)
 
 
 def likelier(
@@ -172,7 +172,7 @@ def weighed(
     rival = afresh(setup, record.swapped(swapped), None, older, also=fit) if late else None
     if rival is None or not rival.valid:
         return record, fit, swapped
-    ahead = fit.evidence + _log_prior(late, open_) - rival.evidence - _log_prior(0, open_)
+    ahead = fit.evidence + log_jeffreys(late, open_) - rival.evidence - log_jeffreys(0, open_)
     if ahead < 0.0:
         record, fit, rival = record.swapped(swapped), rival, fit
         swapped -= frozenset(range(record.first, record.end))
@@ -180,9 +180,3 @@ def weighed(
     wider[:3, :3] += rival.crossings_cov
     wider /= 1.0 + exp(min(abs(ahead), 700.0))
     return record, replace(fit, spread=fit.spread + wider), swapped
-
-
-def _log_prior(late: int, count: int) -> float:
-    """Logarithm of the prior probability that just these of `count` commands were late."""
-    a, b = late + 0.5, max(count - late, 0) + 0.5
-    return lgamma(a) + lgamma(b) - lgamma(a + b)

@@ -27,7 +27,13 @@ from backlash_ros.core.estimation.late_commands import likelier, weighed
 from backlash_ros.core.estimation.posterior import Prior, WindowFit
 from backlash_ros.core.estimation.settings import BLOCKS, FEWEST, MISFIT, PREDICTED, SHORT_RECORD
 from backlash_ros.core.estimation.unmodelled import as_known, coasts, with_walk
-from backlash_ros.core.plant.numerics import agree, chi_square, isolated, log_density, squares_of
+from backlash_ros.core.plant.numerics import (
+    agree,
+    isolated,
+    log_density,
+    most_by_chance,
+    squares_of,
+)
 from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.window import Window
 
@@ -217,24 +223,18 @@ def _contradicts(problem: Problem, held: WindowFit, fit: WindowFit, new: int, rh
     weights = problem.at(fit).weights
     z = problem.residual(fit) / held.noise
     total = float(weights.sum())
-    if np.nansum(weights * z**2) > total * _most(settings.AS_GOOD**2, total, rho):
+    if np.nansum(weights * z**2) > total * most_by_chance(settings.AS_GOOD**2, total, rho):
         return True
     weights, z = weights[new:], z[new:]
     count, wild = float(weights.sum()), np.abs(z) > settings.GATE
     mean = float(np.nansum(weights * np.where(wild, 0.0, z**2))) / max(count, 1e-300)
-    return mean > _most(MISFIT, count, rho) or bool((wild & ~_outliers(z)).any())
+    return mean > most_by_chance(MISFIT, count, rho) or bool((wild & ~_outliers(z)).any())
 
 
 def _outliers(z: Array) -> NDArray[np.bool_]:
     """Which normalized residuals (N,), nan where y was lost, are outliers."""
     return isolated(np.abs(z) > settings.GATE, np.flatnonzero(np.isfinite(z)),
                     settings.OUTLIER_SHARE, settings.OUTLIERS)
-
-
-def _most(least: float, count: float, rho: float) -> float:
-    """Limit on the mean square of count normalized residuals: `least`, or what chance explains."""
-    free = max(count / (1.0 + (count - 1.0) * rho), 1.0)
-    return max(least, chi_square(1e-5, free) / free)
 
 
 def _doubted(setup: Setup, record: Window, before: Belief) -> Belief:

@@ -13,7 +13,7 @@ import numpy as np
 from backlash_ros.core.estimation import settings
 from backlash_ros.core.estimation.fit import FIRST_STEPS, Problem
 from backlash_ros.core.estimation.posterior import WindowFit
-from backlash_ros.core.plant.backlash import clamp
+from backlash_ros.core.plant.backlash import coasted
 from backlash_ros.core.plant.numerics import basis, lfilter
 from backlash_ros.core.plant.transfer_function import Array
 
@@ -38,15 +38,9 @@ def as_known(problem: Problem, known: Array, fit: WindowFit) -> WindowFit:
 
 def coasting_score(problem: Problem, fit: WindowFit) -> float:
     """kappa over its standard deviation for white residuals; 0 for a small kappa."""
-    v, p = problem.v, problem.at(fit).p
-    beyond, speed = [0.0], 0.0  # distance of a load that coasts freely from p
-    for k, move in enumerate(np.diff(p).tolist(), 1):
-        speed = move or speed
-        # It starts anew from the side that moves it, and stops at the other.
-        away = 0.0 if move else clamp(beyond[-1] + speed, v[k] - p[k], v[k] + fit.gap - p[k])
-        beyond.append(away)
     b, a = problem.family.at(fit.xi)
-    column = lfilter(b, a, fit.m * np.array(beyond))[problem.known]
+    beyond = coasted(problem.v, problem.at(fit).p, fit.gap)
+    column = lfilter(b, a, fit.m * beyond)[problem.known]
     q = basis(problem.jacobian(fit)[problem.known])
     s = column - q @ (q.T @ column)
     squares = float(s @ s)

@@ -106,7 +106,7 @@ class FixedBacklash(Law):
 
     def _look_ahead(self) -> None:
         """Compute the gain for the next sample, and x then, but for u and y: lists, as above."""
-        cross = self._c * self._root_ahead.T @ self._root_ahead[:, 0]
+        cross = self._c * (self._root_ahead[:, 0] @ self._root_ahead)
         self._gain: list[float] = (cross / (self._c * cross[0] + self._noise_var)).tolist()
         self._x_ahead = [dot(row, self._x) for row in self._rows]
 

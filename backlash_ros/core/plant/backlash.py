@@ -94,6 +94,17 @@ def play(
     return np.where(rises, np.maximum(p, v), np.minimum(p, v + wide))
 
 
+def coasted(v: Array, p: Array, gap: float) -> Array:
+    """How far a load that coasts freely in the gap gets ahead of p (N,), for v (N,)."""
+    beyond, speed = [0.0], 0.0
+    for k, move in enumerate(np.diff(p).tolist(), 1):
+        speed = move or speed
+        # It starts anew from the side that moves it, and stops at the other.
+        away = 0.0 if move else clamp(beyond[-1] + speed, v[k] - p[k], v[k] + gap - p[k])
+        beyond.append(away)
+    return np.array(beyond)
+
+
 def engaged(v: Array, p: Array, gap: float) -> Sides:
     """Return the side that was engaged last at each sample (N,); GAP before any was."""
     now = np.where(p == v, Region.RIGHT, np.where(p == v + gap, Region.LEFT, Region.GAP))

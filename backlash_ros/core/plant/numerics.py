@@ -10,7 +10,7 @@ from bisect import bisect_left, insort
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
-from math import sqrt
+from math import lgamma, sqrt
 from operator import mul
 from typing import Any, NamedTuple
 
@@ -81,6 +81,12 @@ def state_responses(a: Sequence[float], count: int) -> Array:
     a: coefficients of A (n + 1,). count: N.
     """
     return shifted(lfilter([1.0], a, np.eye(1, count)[0]), len(a) - 1)
+
+
+def rest_of(b: Sequence[float], a: Sequence[float]) -> Array:
+    """State of b/a, as `lfilter` takes it, after an input of 1 for ever, (n,)."""
+    taps, poles = np.array(b), np.array(a)
+    return np.asarray(np.cumsum((taps - poles * taps.sum() / poles.sum())[:0:-1])[::-1])
 
 
 def sensitivities(family: Family, xi: list[float], u: Array, y: Array) -> Array:
@@ -383,6 +389,21 @@ def chi_square(probability: float, freedom: float) -> float:
     from scipy.special import chdtri  # where it is needed: 31 MB
 
     return float(chdtri(freedom, probability))
+
+
+def most_by_chance(least: float, count: float, rho: float) -> float:
+    """Limit on the mean square of count normalized residuals: `least`, or what chance explains.
+
+    rho: their correlation.
+    """
+    free = max(count / (1.0 + (count - 1.0) * rho), 1.0)
+    return max(least, chi_square(1e-5, free) / free)
+
+
+def log_jeffreys(hits: int, count: int) -> float:
+    """Log-probability that just these of `count` trials are hits, by the prior of Jeffreys."""
+    a, b = hits + 0.5, max(count - hits, 0) + 0.5
+    return lgamma(a) + lgamma(b) - lgamma(a + b)
 
 
 def agree(one: Array, other: Array, cov: Array, chance: float) -> bool:
