@@ -12,12 +12,12 @@ import numpy as np
 from backlash_ros.core.estimation import settings
 from backlash_ros.core.estimation.fit import FEW_STEPS, FIRST_STEPS, NEAR, Problem
 from backlash_ros.core.estimation.plant_family import PlantFamily
-from backlash_ros.core.estimation.posterior import Prior, WindowFit, gap_variance
+from backlash_ros.core.estimation.posterior import Prior, WindowFit
 from backlash_ros.core.estimation.search import search
 from backlash_ros.core.estimation.unmodelled import coasting_score, with_walk
 from backlash_ros.core.law import OutOfBounds
 from backlash_ros.core.parameters import Bounds
-from backlash_ros.core.plant.backlash import play
+from backlash_ros.core.plant.backlash import gap_variance, play
 from backlash_ros.core.plant.numerics import std_of
 from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.window import Window

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from backlash_ros.core.estimation.settings import CHANCE
+from backlash_ros.core.plant.backlash import gap_variance
 from backlash_ros.core.plant.numerics import agree
 from backlash_ros.core.plant.transfer_function import Array
 
@@ -150,11 +151,6 @@ class WindowFit:
     def valid(self) -> bool:
         """Whether the slope is positive and the covariance finite."""
         return self.m > 0.0 and self.cov.size > 0 and bool(np.isfinite(self.cov).all())
-
-
-def gap_variance(cov: Array) -> float:
-    """Variance of c_r - c_l, given a covariance of m, c_r, c_l and any others after them."""
-    return max(float(cov[1, 1] + cov[2, 2] - 2.0 * cov[1, 2]), 0.0)
 
 
 def error_of_plant(

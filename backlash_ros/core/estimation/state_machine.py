@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Status
-from backlash_ros.core.estimation import posterior, settings
+from backlash_ros.core.estimation import settings
 from backlash_ros.core.estimation.belief import Belief, Known, State, Trial, shortened
 from backlash_ros.core.estimation.explanations import Setup, afresh, mixed
 from backlash_ros.core.estimation.fit import FEW_STEPS, Problem
@@ -27,13 +27,8 @@ from backlash_ros.core.estimation.late_commands import likelier, weighed
 from backlash_ros.core.estimation.posterior import Prior, WindowFit
 from backlash_ros.core.estimation.settings import BLOCKS, FEWEST, MISFIT, PREDICTED, SHORT_RECORD
 from backlash_ros.core.estimation.unmodelled import as_known, coasts, with_walk
-from backlash_ros.core.plant.numerics import (
-    agree,
-    isolated,
-    log_density,
-    most_by_chance,
-    squares_of,
-)
+from backlash_ros.core.plant.backlash import gap_variance
+from backlash_ros.core.plant.numerics import agree, chance_limit, isolated, log_density, squares_of
 from backlash_ros.core.plant.transfer_function import Array
 from backlash_ros.core.window import Window
 
@@ -223,12 +218,12 @@ def _contradicts(problem: Problem, held: WindowFit, fit: WindowFit, new: int, rh
     weights = problem.at(fit).weights
     z = problem.residual(fit) / held.noise
     total = float(weights.sum())
-    if np.nansum(weights * z**2) > total * most_by_chance(settings.AS_GOOD**2, total, rho):
+    if np.nansum(weights * z**2) > total * chance_limit(settings.AS_GOOD**2, total, rho):
         return True
     weights, z = weights[new:], z[new:]
     count, wild = float(weights.sum()), np.abs(z) > settings.GATE
     mean = float(np.nansum(weights * np.where(wild, 0.0, z**2))) / max(count, 1e-300)
-    return mean > most_by_chance(MISFIT, count, rho) or bool((wild & ~_outliers(z)).any())
+    return mean > chance_limit(MISFIT, count, rho) or bool((wild & ~_outliers(z)).any())
 
 
 def _outliers(z: Array) -> NDArray[np.bool_]:
@@ -310,7 +305,7 @@ def _beside_inherited(setup: Setup, belief: Belief, fit: WindowFit, known: Known
     if not agree(fit.crossings, known.crossings, alike, settings.CHANCE):
         # A gear that is not pure play leaves systematic residuals, which refute nothing.
         sure = not fit.systematic and fit.left.turns >= settings.HELD_REVERSALS and \
-            posterior.gap_variance(cov) < (replacing * fit.gap) ** 2
+            gap_variance(cov) < (replacing * fit.gap) ** 2
         if sure and belief.trial.predicted >= belief.trial.must:
             belief = belief._replace(inherited=None)  # it belonged to another plant
         return belief._replace(reason=Status.INCONSISTENT)

@@ -94,6 +94,11 @@ def play(
     return np.where(rises, np.maximum(p, v), np.minimum(p, v + wide))
 
 
+def gap_variance(cov: Array) -> float:
+    """Variance of c_r - c_l, given a covariance of m, c_r, c_l and any others after them."""
+    return max(float(cov[1, 1] + cov[2, 2] - 2.0 * cov[1, 2]), 0.0)
+
+
 def coasted(v: Array, p: Array, gap: float) -> Array:
     """How far a load that coasts freely in the gap gets ahead of p (N,), for v (N,)."""
     beyond, speed = [0.0], 0.0

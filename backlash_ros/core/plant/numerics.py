@@ -391,7 +391,7 @@ def chi_square(probability: float, freedom: float) -> float:
     return float(chdtri(freedom, probability))
 
 
-def most_by_chance(least: float, count: float, rho: float) -> float:
+def chance_limit(least: float, count: float, rho: float) -> float:
     """Limit on the mean square of count normalized residuals: `least`, or what chance explains.
 
     rho: their correlation.
