@@ -146,7 +146,7 @@ def afresh(
 
 def mixed(p: Problem, best: WindowFit, others: Sequence[WindowFit] = ()) -> WindowFit:
     """The likeliest of these fits and of others nearby, with the spread of the mixture."""
-    rival, chance = _behind(p, best)
+    rival, chance = _wiener(p, best)
     if chance > 0.5:
         best, rival, chance, others = rival, best, 1.0 - chance, ()
     wider, beyond = _along_the_gap(p, best)
@@ -167,7 +167,7 @@ def mixed(p: Problem, best: WindowFit, others: Sequence[WindowFit] = ()) -> Wind
     return replace(best, spread=wider + chance * apart(rival, best))
 
 
-def _behind(p: Problem, best: WindowFit) -> tuple[WindowFit, float]:
+def _wiener(p: Problem, best: WindowFit) -> tuple[WindowFit, float]:
     """The fit of a play behind G, which xi and a wrong gap can imitate, and its probability.
 
     `best` and 0 if out of question: white residuals and a small xi, an integrator, coasting.
@@ -176,7 +176,7 @@ def _behind(p: Problem, best: WindowFit) -> tuple[WindowFit, float]:
     if white or best.wiener or not best.valid or p.family.leaks or not p.family.count:
         return best, 0.0
     with suppress(np.linalg.LinAlgError):
-        f = p.behind(best)
+        f = p.wiener(best)
         if f.valid and (f.left.rms < best.left.rms or coasting_score(p, best) < settings.BY_CHANCE):
             return f, 1.0 / (1.0 + exp(min(best.odds_over(f), 700.0)))
     return best, 0.0

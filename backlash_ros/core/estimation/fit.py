@@ -284,12 +284,12 @@ class Problem:
     def towards(self, f: WindowFit, new: WindowFit, share: float = 1.0) -> WindowFit:
         """The fit at this share of the way from f to new, or beyond it."""
         furthest = float(np.abs(new.theta[3:] - f.theta[3:]).max(initial=0.0))
-        share *= 2.0 / max(furthest, 2.0)  # xi: two prior deviations a step, at most
+        length = share * (2.0 / max(furthest, 2.0))  # xi: two prior deviations a step, at most
         order, knots = max(len(f.x), len(new.x)), self._walk_of(f)[1]
         old, x = padded(f.x, order), padded(new.x, order)
-        return replace(new, x=old + share * (x - old), knots=knots + share * (new.knots - knots),
-                       p0=f.p0 + share * (new.p0 - f.p0),
-                       theta=f.theta + share * (new.theta - f.theta))
+        return replace(
+            new, x=old + length * (x - old), knots=knots + length * (new.knots - knots),
+            p0=f.p0 + length * (new.p0 - f.p0), theta=f.theta + length * (new.theta - f.theta))
 
     def _with_noise(self, f: WindowFit) -> WindowFit:
         """This fit with the noise_std that its residuals show."""
@@ -340,7 +340,7 @@ class Problem:
             theta[1], knots = theta[1] + best[-1], knots + best[n:-1]
         return replace(f, x=best[:n], knots=knots, theta=theta)
 
-    def behind(self, f: WindowFit) -> WindowFit:
+    def wiener(self, f: WindowFit) -> WindowFit:
         """A finished fit with the play behind G, as told unless another G is likelier."""
         begin = self.begun(replace(f.without_intervals(f.walk_std), x=np.zeros(1), wiener=True,
                                    theta=np.append(f.theta[:3], 0.0 * f.theta[3:])))

@@ -98,7 +98,7 @@ def _searching(setup: Setup, record: Window, before: Belief) -> Belief:
                             found=None, reason=why, coasts=False)
     if found is None:
         return after
-    if coasts(setup.problem(part), found):
+    if coasts(setup.problem(part), found, before.published and before.published.crossings):
         after = after._replace(coasts=True, reason=Status.INCONSISTENT)
     after = after._replace(kept=before.kept._replace(swapped=swapped), found=found)
     if not setup.is_known(found):

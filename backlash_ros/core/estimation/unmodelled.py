@@ -18,14 +18,16 @@ from backlash_ros.core.plant.numerics import basis, lfilter
 from backlash_ros.core.plant.transfer_function import Array
 
 
-def coasts(problem: Problem, fit: WindowFit) -> bool:
-    """Whether residuals are correlated because the load coasts within the gap."""
+def coasts(problem: Problem, fit: WindowFit, known: Array | None = None) -> bool:
+    """Whether residuals are correlated because the load coasts within the gap: that of the fit, or
+    of earlier m, c_r, c_l `known` (3,), as with coasting a fit may find next to no gap."""
     named = 8.0  # least kappa over its standard deviation; high, as residuals are far from white
     matters = 2e-3  # least unexplained motion over the gap; quantization of slow motion leaves less
     if not (fit.m > 0.0 and fit.left.turns and fit.systematic and fit.unexplained > matters):
         return False
-    before = as_known(problem, fit.crossings, fit) if fit.wiener else fit
-    return coasting_score(problem, before) > named
+    tested = [as_known(problem, fit.crossings, fit) if fit.wiener else fit]
+    tested += [] if known is None else [as_known(problem, known, fit)]
+    return any(coasting_score(problem, f) > named for f in tested)
 
 
 def as_known(problem: Problem, known: Array, fit: WindowFit) -> WindowFit:
