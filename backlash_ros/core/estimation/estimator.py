@@ -15,7 +15,6 @@ from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.estimation import settings
 from backlash_ros.core.estimation.belief import Belief, Kept, Known
 from backlash_ros.core.estimation.explanations import Setup
-from backlash_ros.core.estimation.fit import FEW_STEPS
 from backlash_ros.core.estimation.observer import Following, Place
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.state_machine import learn
@@ -62,10 +61,8 @@ def fitted(
     problem, crossings, noise = setup.problem(part, kept.older), fit.crossings, fit.noise
     if belief.inherited is not None:
         crossings = belief.published.crossings
-        if not fit.systematic:  # holding it improves x and xi, unless they absorb friction
-            problem = problem.holding(*crossings.tolist())
-            with suppress(np.linalg.LinAlgError):
-                fit = problem.fitted(fit, FEW_STEPS)
+        with suppress(np.linalg.LinAlgError):  # x and xi that suit it
+            fit = problem.holding(*crossings.tolist()).fitted(fit)
     if fit.wiener:
         fit = as_known(problem, crossings, fit)
         noise = fit.left.rms

@@ -146,6 +146,8 @@ def afresh(
 
 def mixed(p: Problem, best: WindowFit, others: Sequence[WindowFit] = ()) -> WindowFit:
     """The likeliest of these fits and of others nearby, with the spread of the mixture."""
+    if not (best.credible or best.wiener or coasting_score(p, best) > settings.BY_CHANCE):
+        best, others = p.likelier_as_told(best), ()
     rival, chance = _wiener(p, best)
     if chance > 0.5:
         best, rival, chance, others = rival, best, 1.0 - chance, ()
@@ -176,7 +178,7 @@ def _wiener(p: Problem, best: WindowFit) -> tuple[WindowFit, float]:
     if white or best.wiener or not best.valid or p.family.leaks or not p.family.count:
         return best, 0.0
     with suppress(np.linalg.LinAlgError):
-        f = p.wiener(best)
+        f = p.likelier_as_told(p.anew(best, True, False))
         if f.valid and (f.left.rms < best.left.rms or coasting_score(p, best) < settings.BY_CHANCE):
             return f, 1.0 / (1.0 + exp(min(best.odds_over(f), 700.0)))
     return best, 0.0
@@ -223,8 +225,8 @@ def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]
             if not 0.0 < gap < widest:
                 break
             normal = likeliest - 0.5 * reach**2
-            # After many reversals a likelihood that falls like a normal one goes on like that.
-            close = 0.1 * reach**2 if best.left.turns >= settings.HELD_REVERSALS else 0.0
+            # After many reversals a likelihood that begins to fall like a normal one goes on so.
+            close = 0.1 * reach**2 * (not nearer and best.left.turns >= settings.HELD_REVERSALS)
             # Continuation: from where the last two points lead, as p0 and o change with the gap.
             near = p.towards(last, there, (gap - last.gap) / (there.gap - last.gap or 1.0))
             last, (value, there) = there, _with_gap(p, near, gap, weights, normal, close)

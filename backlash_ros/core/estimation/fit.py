@@ -29,6 +29,7 @@ from backlash_ros.core.plant.transfer_function import Array, Family
 
 STEPS, FIRST_STEPS, FEW_STEPS = 16, 6, 3  # limits on the number of Gauss-Newton steps
 NEAR = 0.1, 0.3, 1.0, 1.0  # how far xi moves in the first steps, where the linearization is bad
+NONE = 1e-6  # how far xi moves where it is held
 
 
 class Run(NamedTuple):
@@ -104,10 +105,7 @@ class Problem:
     @cached_property
     def _walk(self) -> Array:
         """Basis of d: hat functions (W, N), knots some 8 samples apart or more, 0 at the end."""
-        count = len(self.v)
-        knots = self._knots or min(max(count // 8, 1), 36)
-        place = np.arange(count) * knots / max(count - 1, 1)
-        return np.asarray(np.maximum(1.0 - np.abs(place - np.arange(knots)[:, None]), 0.0))
+        return numerics.hats(len(self.v), self._knots or min(max(len(self.v) // 8, 1), 36))
 
     def _walk_of(self, f: WindowFit) -> tuple[Array, Array, float]:
         """Hats, knot values, standard deviation of their differences; no hats unless u walks."""
@@ -245,12 +243,7 @@ class Problem:
                     near = iter(())
                     continue
                 cov = f.cov if f.cov.size else new.cov
-                f = replace(f, cov=cov, scale=new.scale, volume=new.volume)
-                again = f if f.step else self._with_noise(f)
-                if again.noise_std > 0.9 * f.noise_std:
-                    return f
-                f = again
-                continue
+                return replace(f, cov=cov, scale=new.scale, volume=new.volume)
             moved = abs(there.gap - f.gap) / max(sqrt(max(new.cov[2, 2], 0.0)), 1e-300)
             f = there if there.step else self._with_noise(there)
             if value - best < (1.0 if moved < least_move else least_gain):
@@ -263,28 +256,26 @@ class Problem:
         self, f: WindowFit, best: float, w: Array, reach: float, held: bool, begun: bool,
     ) -> tuple[WindowFit, WindowFit, float]:
         new = self.step(f, reach, held, begun)
-        there = self.towards(f, new)
-        value = self.log_posterior(there, w)
-        if -inf < value <= best - 0.5:
-            # Beyond a kink, where the other side is engaged, a second step may succeed.
-            with suppress(np.linalg.LinAlgError):
-                again = self.towards(there, self.step(there, reach, held, begun))
-                of_again = self.log_posterior(again, w)
-                if of_again > best:
-                    there, value = again, of_again
-        length = 1.0
-        while not value > best - 0.5 and length > 0.05:
-            length *= 0.3
+        for length in (1.0, 0.3, 0.09, 0.027):
             there = self.towards(f, new, length)
-            if length > 0.2:  # the first of these: another xi needs another X, which is linear in y
-                there = self.begun(there)
             value = self.log_posterior(there, w)
-        return new, there, value
+            # Variable projection: another xi needs another X, d, m and o, in which y is linear. And
+            # beyond a kink, where the other side is engaged, a second step may succeed.
+            for more in ((NONE, True, True), (reach, held, begun))[:1 + (length == 1.0)]:
+                if -inf < value <= best - 0.5:
+                    with suppress(np.linalg.LinAlgError):
+                        beside = self.towards(there, self.step(there, *more))
+                        of_beside = self.log_posterior(beside, w)
+                        if of_beside > value:
+                            there, value = beside, of_beside
+            if value > best - 0.5:
+                break
+        return new, replace(there, cov=new.cov, scale=new.scale, volume=new.volume), value
 
-    def towards(self, f: WindowFit, new: WindowFit, share: float = 1.0) -> WindowFit:
+    def towards(self, f: WindowFit, new: WindowFit, length: float = 1.0) -> WindowFit:
         """The fit at this share of the way from f to new, or beyond it."""
         furthest = float(np.abs(new.theta[3:] - f.theta[3:]).max(initial=0.0))
-        length = share * (2.0 / max(furthest, 2.0))  # xi: two prior deviations a step, at most
+        length *= 2.0 / max(furthest, 2.0)  # xi: two prior deviations a step, at most
         order, knots = max(len(f.x), len(new.x)), self._walk_of(f)[1]
         old, x = padded(f.x, order), padded(new.x, order)
         return replace(
@@ -340,19 +331,23 @@ class Problem:
             theta[1], knots = theta[1] + best[-1], knots + best[n:-1]
         return replace(f, x=best[:n], knots=knots, theta=theta)
 
-    def wiener(self, f: WindowFit) -> WindowFit:
-        """A finished fit with the play behind G, as told unless another G is likelier."""
-        begin = self.begun(replace(f.without_intervals(f.walk_std), x=np.zeros(1), wiener=True,
-                                   theta=np.append(f.theta[:3], 0.0 * f.theta[3:])))
-        free, told = (self.finished(self.fitted(g)) for g in (begin, replace(begin, told=True)))
-        return told if free.odds_over(told) < 0.0 else free
+    def likelier_as_told(self, f: WindowFit) -> WindowFit:
+        """This finished fit or, if that is likelier, the one with G as told."""
+        told = self.anew(f, f.wiener, True)
+        return told if f.odds_over(told) < 0.0 else f
+
+    def anew(self, f: WindowFit, wiener: bool, told: bool) -> WindowFit:
+        """A finished fit that begins with m, o and gap of f, and with G as told."""
+        begin = replace(f.without_intervals(f.walk_std), x=np.zeros(1), wiener=wiener, told=told,
+                        theta=np.append(f.theta[:3], 0.0 * f.theta[3:]))
+        return self.finished(self.fitted(self.begun(begin)))
 
     def with_intervals(self, f: WindowFit) -> WindowFit:
         """The finished fit, by the interval likelihood unless noise hides the quantization."""
         # noise_std is the likeliest of a grid, but large enough that there is a reading near an
         # edge of its interval for every unknown: with fewer, the posterior would not be normal.
         step, unknowns = self.step_of_readings, len(f.x) + len(f.knots) + 1 + len(f.theta)
-        largest, edges = 0.25 * step, unknowns / max(float(self.at(f).weights.sum()), 1.0)
+        largest, edges = 0.5 * step, unknowns / max(float(self.at(f).weights.sum()), 1.0)
         least = min(step * max(1.0 / 64.0, edges), largest)
         if not step or f.wiener or f.m <= 0.0 or (not f.step and f.noise_std > 0.75 * step):
             return self.finished(f)
@@ -360,7 +355,7 @@ class Problem:
         def at(level: float, begin: WindowFit) -> WindowFit:
             return self.finished(self.fitted(replace(begin, step=step, noise_std=level), FEW_STEPS))
 
-        first = max(min(f.noise_std if f.step else largest, largest), least)
+        first = max(min(f.noise_std if f.step else 0.25 * step, largest), least)
         best = at(first, f)
         for factor in (0.5, 2.0):
             if best.noise_std < first:

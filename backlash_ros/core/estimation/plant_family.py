@@ -11,7 +11,7 @@ that are kept: on the negative axis or on the unit circle. Poles at 0 are a dela
 
 from collections.abc import Sequence
 from itertools import zip_longest
-from math import copysign, floor, inf
+from math import copysign, floor
 
 import numpy as np
 
@@ -49,11 +49,11 @@ class PlantFamily:
         # However short G is, a lag of one sample is usual: drivers apply v, or read y, that late.
         stable = TransferFunction(b.tolist(), padded(np.array(a), len(model.denominator)).tolist())
         late = max(stable.group_delay, 5.0)
-        # Prior std and limit of what each xi changes. Limits: a leak of 0.1 a sample,
-        # a lag of 40 samples, a factor of 20 on Omega and D. 0.125: acting half a sample late.
+        # Prior std and limit of what each xi changes. Limits: a leak of 0.1 a sample, a lag of 40,
+        # a mean over 5 samples, a factor of 20 on Omega and D. 0.125: acting half a sample late.
         self._scales = [
             *[(5e-3 * uncertainty, 0.1)] * self.integrates, (uncertainty * late, 40.0),
-            (0.125, inf), *[(uncertainty, 3.0)] * len(self._nominal)] if uncertainty > 0.0 else []
+            (0.125, 1.0), *[(uncertainty, 3.0)] * len(self._nominal)] if uncertainty > 0.0 else []
         # The size of a leak says nothing about how wrong the rest of G is.
         self.count, self.leaks = len(self._scales), int(self.integrates and uncertainty > 0.0)
         shorter = np.poly1d([1.0, 1.0]) ** max(len(b) - 2, 0)

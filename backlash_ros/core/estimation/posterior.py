@@ -96,6 +96,11 @@ class WindowFit:
         own, its = (0.5 * k * min(x, 1.0) ** 2 + k * log(max(x, 1.0)) for x in sizes)
         return its - own + self.left.readings / self.inflation * log(other.left.rms / self.left.rms)
 
+    @property
+    def credible(self) -> bool:
+        """Whether xi lies within the widest of its priors."""
+        return bool(np.linalg.norm(self.theta[3:]) <= SCALES[-1] * sqrt(len(self.theta) - 3))
+
     def behind(self, xi: Array) -> float:
         """Log-likelihood by which another xi (K,) is worse than that of this fit."""
         apart = self.theta[3:] - xi

@@ -81,8 +81,10 @@ def _searching(setup: Setup, record: Window, before: Belief) -> Belief:
     if tried is not None and not known_once and record.end < before.thorough[0] \
             and not setup.is_known(tried, record.turns(max(tried.gap, 0.0), tried.p0)):
         return before._replace(end=record.end, next_at=soon)
-    # If many reversals did not suffice, a few more will not: wait longer for the next search.
-    growth = 2.0 if tried and tried.left.turns >= settings.HELD_REVERSALS else settings.GROWTH
+    # If many reversals of the widest gap that it leaves open did not suffice, wait for more.
+    many = tried is not None and tried.valid and record.turns(
+        tried.gap + settings.BY_CHANCE * tried.gap_std, tried.p0) >= settings.HELD_REVERSALS
+    growth = 2.0 if many else settings.GROWTH
     search_at = record.end + max(int(count * (growth - 1.0)), FEWEST)
     fit, shorter = afresh(setup, record, also=tried, walks=True), record
     why = _why(setup, fit, record, before)
@@ -303,9 +305,9 @@ def _beside_inherited(setup: Setup, belief: Belief, fit: WindowFit, known: Known
         prior = prior + settings.LOST_MOTION**2 * np.diag(size**2 / [4.0, 2.0, 2.0])
     alike, another = cov + prior, cov + prior + np.diag(size**2)
     if not agree(fit.crossings, known.crossings, alike, settings.CHANCE):
-        # A gear that is not pure play leaves systematic residuals, which refute nothing.
+        # A gear that is not pure play leaves systematic residuals, or moves xi beyond its prior.
         sure = not fit.systematic and fit.left.turns >= settings.HELD_REVERSALS and \
-            gap_variance(cov) < (replacing * fit.gap) ** 2
+            gap_variance(cov) < (replacing * fit.gap) ** 2 and fit.credible
         if sure and belief.trial.predicted >= belief.trial.must:
             belief = belief._replace(inherited=None)  # it belonged to another plant
         return belief._replace(reason=Status.INCONSISTENT)

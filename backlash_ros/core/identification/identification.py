@@ -119,16 +119,14 @@ def identify(
     if nothing := _why_nothing(v, y[part], options):
         return Identification(sample_period, v, y, refused=nothing)
     slow = rate_limit(v[part], y[part])
-    if slow is not None:
-        v = limited(v, slow)
+    v = v if slow is None else limited(v, slow)
     given = Identification(sample_period, v, y)
     units = Units(float(v.mean()), float(np.ptp(v[part])), float(np.nanmedian(y)),
                   float(np.nanstd(y[part])))
     v, y = (v - units.v) / units.v_size, (y - units.y) / units.y_size
     s = search.searched(models.Samples(v[part], y[part], 0, 0, 0.0, units), options,
                         options.delays or search.EARLY, progress)
-    if not options.delays:
-        s = search.later(s, options, progress)
+    s = s if options.delays else search.later(s, options, progress)
     progress('fitting the whole record')
     best, samples, rows = s.best, s.samples, effective(s.best.left)
     # Rivals differ in the delay alone and fit about as well.

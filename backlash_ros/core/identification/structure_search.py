@@ -93,14 +93,16 @@ def searched(
     """Find the best structure with one of these delays for the whole record."""
     progress('searching the gap')
     units, samples = record.units, replace(record, first=max(delays) + 1, last=len(record.v))
-    found, drifting = _with_general(samples, delays), replace(samples, drifts=True)
-    with_drift = found if samples.drifts else _with_general(drifting, delays)
-    if found[0].rms > AS_GOOD * with_drift[0].rms:
-        samples, found = drifting, with_drift
+    (found, fewer), drifting = _with_general(samples, delays), replace(samples, drifts=True)
+    if not samples.drifts:
+        drifts, with_fewer = _with_general(drifting, delays)
+        # One pole more, close to 1, may stand in for a drift.
+        stands_in = with_fewer.rms < AS_GOOD * found[0].rms < fewer.rms
+        if found[0].rms > AS_GOOD * drifts[0].rms or stands_in:
+            samples, found = drifting, drifts
     kept = cleaned(samples, found[0])
     if kept.y is not samples.y or kept.step != samples.step:
-        samples = kept
-        found = sorted(fitted(samples, one.structure, one.fit) for one in found)
+        samples, found = kept, sorted(fitted(kept, one.structure, one.fit) for one in found)
     cut = samples.last - round(HELD_OUT * len(samples.fitted_y))
     structures = [
         Structure(order, delay, integrator) for integrator in options.integrators
@@ -131,8 +133,8 @@ def searched(
             (one.whole.gap, one.criterion - chosen.criterion) for one in _eligible(compared)]))
 
 
-def _with_general(samples: Samples, delays: Sequence[int]) -> list[Model]:
-    """Models of different gaps with a general G, the best first."""
+def _with_general(samples: Samples, delays: Sequence[int]) -> tuple[list[Model], Model]:
+    """Models of different gaps with a general G, the best first, and one with a pole less."""
     # One pole after the other, as several at once often end up close to 1, with a wrong gap.
     first, *others = (Structure(poles, min(delays), False, poles + max(delays) - min(delays))
                       for poles in range(GENERAL_POLES + 1))
@@ -140,12 +142,12 @@ def _with_general(samples: Samples, delays: Sequence[int]) -> list[Model]:
                     for gap in (np.ptp(samples.v) * np.array([0.0, 0.05, 0.2, 0.5])).tolist())
     best = fitted(samples, first, *(one.fit for one in begins[:2]), steps=FEW_STEPS)
     for general in others:
-        anew = first_model(samples, general, best.gap, best.fit.p0).fit
+        fewer, anew = best, first_model(samples, general, best.gap, best.fit.p0).fit
         best = fitted(samples, general, anew, best.begin_with_pole(0.6, general), steps=FEW_STEPS)
     models = _of_gaps(samples, best)
     # Linearised around a better G, the search may find another gap.
-    return _of_gaps(samples, models[0]) if models[0].squares < 0.9 * best.squares else models
-
+    better = models[0].squares < 0.9 * best.squares
+    return (_of_gaps(samples, models[0]) if better else models), fewer
 
 def _of_gaps(samples: Samples, like: Model) -> list[Model]:
     """Fits of the structure of `like` from each local minimum over the gap, the best first."""

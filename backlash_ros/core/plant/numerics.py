@@ -67,6 +67,12 @@ def padded(x: Array, length: int) -> Array:
     return np.append(x, np.zeros(max(length - len(x), 0)))[:length]
 
 
+def hats(count: int, knots: int) -> Array:
+    """Hat functions around equally spaced knots, (knots, count); all are 0 at the last sample."""
+    place = np.arange(count) * knots / max(count - 1, 1)
+    return np.asarray(np.maximum(1.0 - np.abs(place - np.arange(knots)[:, None]), 0.0))
+
+
 def shifted(x: Array, count: int) -> Array:
     """Return x (..., N) delayed by 0, 1, ... samples, with zeros before it: (..., count, N)."""
     out = np.zeros((*x.shape[:-1], count, x.shape[-1]))

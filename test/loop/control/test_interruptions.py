@@ -59,7 +59,8 @@ def restarted(loop: Loop) -> AdaptiveController:
     return new
 
 
-@pytest.mark.parametrize('p', [TRACKING, G_IS_SLOWER])
+@pytest.mark.parametrize(
+    'p', [TRACKING, G_IS_SLOWER, *(G_IS_SLOWER.replaced({'seed': seed}) for seed in (2, 3, 4, 12))])
 @pytest.mark.parametrize('again', [interrupted, restarted])
 def test_y_follows_after_an_interruption_as_before(p, again):
     loop = Loop(p.replaced({'plant.uncertainty': 0.2}))
@@ -67,9 +68,11 @@ def test_y_follows_after_an_interruption_as_before(p, again):
     before = loop.rms(400)
     assert before < 0.005
     loop.controller = again(loop)
-    loop.run(2000)
+    loop.run(400)
+    for _ in range(20):
+        loop.run(80)
+        assert loop.rms(80) < 3.0 * before
     assert loop.controller.estimator.estimate.status is Status.TRACKING
-    assert loop.rms(400) < 3.0 * before
 
 
 class Slow(Executor):

@@ -239,6 +239,14 @@ def test_samples_that_contradict_in_a_row_are_none_of_them_lost(seed: int) -> No
     assert tracking[first:].all()  # the leak, once learned, is no contradiction any more
 
 
+@pytest.mark.parametrize('seed', [2, 3, 4, 6])
+def test_a_first_fit_that_leaves_the_gap_open_delays_no_search(seed: int) -> None:
+    run = build_closed_loop(Parameters({
+        'structure': 'tracking', 'amplitude': 0.2, 'output_noise_std': 1e-3, 'seed': seed,
+        'waveform': 'chirp', 'frequency_start': 0.2 * np.pi, 'frequency': 6.0 * np.pi})).run(200)
+    assert run.column('c_r')[-1] == pytest.approx(3.0, abs=0.02)
+
+
 @pytest.mark.parametrize('disturbance', [2.0, -1.0])
 def test_constant_disturbance_is_cancelled_by_effective_crossings(disturbance: float) -> None:
     record = run(500, lambda k, y: y, input_disturbance=disturbance)

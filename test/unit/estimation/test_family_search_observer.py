@@ -9,9 +9,10 @@ from scipy.optimize import least_squares
 from scipy.signal import cont2discrete
 from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR
 
-from backlash_ros.core.estimation.belief import Belief
+from backlash_ros.core.estimate import Status
+from backlash_ros.core.estimation.belief import Belief, Known, State
 from backlash_ros.core.estimation.explanations import Setup, afresh
-from backlash_ros.core.estimation.fit import Problem
+from backlash_ros.core.estimation.fit import FEW_STEPS, Problem
 from backlash_ros.core.estimation.late_commands import weighed
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.posterior import WindowFit
@@ -59,6 +60,17 @@ def test_coefficients_are_finite_however_far_a_fit_strays(far: float) -> None:
     assert sum(b) / sum(a) == pytest.approx(0.8 / 0.526)
     assert np.abs(np.roots(a)).max() <= 1.0
     assert all(np.isfinite(slopes).all() for slopes in family.slopes(xi))
+
+
+def test_no_response_is_wider_than_an_average_over_five_samples() -> None:
+    family = PlantFamily(TransferFunction([1.0], [1.0, 0.0]), 0.2)
+    ts = []
+    for width in (8.0, 1e3):
+        b, _ = family.at([0.0, width])
+        ts.append(b)
+        k = np.arange(len(b))
+        assert np.dot(b, k**2) - np.dot(b, k) ** 2 == pytest.approx(np.var(np.arange(5)))
+    assert ts[0] == ts[1]
 
 
 @pytest.mark.parametrize('omega_t', [0.13, 1.0, 2.5])
@@ -191,6 +203,20 @@ def test_a_fit_that_begins_at_its_optimum_ends_there() -> None:
     assert again.theta == pytest.approx(best.theta, rel=1e-3, abs=1e-3)
     assert again.scale == best.scale > 1.0
     assert again.evidence == pytest.approx(best.evidence, abs=0.1)
+
+
+def test_three_steps_suffice_where_m_stands_in_for_an_error_of_G() -> None:
+    family = PlantFamily(TransferFunction(PAPER_NUMERATOR, PAPER_DENOMINATOR), 0.2)
+    k = np.arange(1000)
+    v = 300.0 * np.sin(0.063 * k) + 100.0 * np.sin(0.2 * k)
+    u = 1.3 * play(v, 6.0, 3.0) - 3.9
+    y = lfilter(*family.at([0.0] * family.count), u)
+    problem = Problem(family, v, y + 1e-3 * np.random.default_rng(1).standard_normal(len(v)), 1e-3)
+    begin = WindowFit(np.zeros(1), 3.0, np.array([1.3, 3.9, 6.0, *[0.0] * family.count]), 1e-3)
+    another = problem.holding(1.25, 3.0, -3.0).fitted(begin, 40)
+    fit = problem.finished(problem.fitted(another, FEW_STEPS))
+    assert fit.m == pytest.approx(1.3, abs=1e-3)
+    assert fit.left.rms < 1e-2
 
 
 def test_readings_that_repeat_one_rounding_count_as_one() -> None:
@@ -350,16 +376,19 @@ def test_commands_that_look_late_are_weighed_against_those_expected(late: bool) 
 
 def moved_by(
     plant: TransferFunction, told: TransferFunction, uncertainty: float, before: bool,
-    count: int = 900,
+    count: int = 900, noise: float = 0.5,
 ) -> tuple[Setup, Window]:
-    """A slow triangle of v, moving a gap of 1 before or behind this plant; y has an encoder."""
+    """A slow triangle of v, moving a gap of 1 before or behind this plant; y has an encoder.
+
+    noise: standard deviation, in steps of the encoder.
+    """
     k, step = np.arange(count), 0.01
     v = 20.0 / np.pi * np.arcsin(np.sin(2.0 * np.pi * k / 300.0))
     b, a = PlantFamily(plant, 0.0).at([])
     u = v if before else lfilter(b, a, v)
     y = play(u, 1.0, u[0] + 0.5) - 0.5
     y = lfilter(b, a, y) if before else y
-    y += 0.5 * step * np.random.default_rng(1).normal(size=count)
+    y += noise * step * np.random.default_rng(1).normal(size=count)
     setup = Setup(PlantFamily(told, uncertainty), step, Parameters().estimator.bounds, 10.0, 0.3,
                   0.0, np.zeros(3))
     return setup, Window(0, v, step * np.round(y / step), np.full(len(v), np.nan))
@@ -410,6 +439,41 @@ def test_a_gap_before_a_G_that_is_far_off_is_known_however_exact_it_was_told(
     assert fit is not None
     assert setup.is_known(fit)
     assert abs(fit.gap - 1.0) < 0.05
+
+
+def beliefs(setup: Setup, record: Window, begin: Belief) -> list[Belief]:
+    found = [begin]
+    for end in range(600, len(record.v), 100):
+        found.append(learn(setup, record.between(found[-1].kept.first, end), found[-1]))
+    return found[1:]
+
+
+@pytest.mark.parametrize(('off', 'refuted'), [(1.05, True), (1.3, False)])
+def test_a_G_that_its_prior_excludes_refutes_nothing_known_before(
+    off: float, refuted: bool,
+) -> None:
+    known = Known(np.array([1.0, 0.6, -0.6]), np.diag([1e-3, 2e-3, 2e-3]) ** 2)
+    setup, record = moved_by(
+        two_poles(0.13), two_poles(0.13 / off), 0.01, before=True, count=1800)
+    last = beliefs(setup, record, Belief(inherited=known, published=known))[-1]
+    assert last.fit is not None
+    assert abs(last.fit.gap - 1.0) < 0.05
+    assert last.reason is (Status.TRACKING if refuted else Status.INCONSISTENT)
+    assert (last.published is known) is not refuted
+
+
+@pytest.mark.parametrize('steps', [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8])
+def test_noise_of_any_share_of_an_encoder_step_is_found_and_contradicts_nothing(
+    steps: float,
+) -> None:
+    servo = two_poles(0.13)
+    setup, record = moved_by(servo, servo, 0.2, before=True, count=1800, noise=steps)
+    found = beliefs(setup, record, Belief())
+    assert all(one.state is State.KNOWN for one in found[2:])
+    last = found[-1].fit
+    assert last is not None
+    assert abs(last.gap - 1.0) < 3.0 * last.gap_std < 0.05
+    assert last.noise == pytest.approx(0.01 * np.hypot(steps, 12.0**-0.5), rel=0.25)
 
 
 def test_friction_and_compliance_are_allowed_for_after_an_event_that_spoils_the_record() -> None:

@@ -113,9 +113,9 @@ def test_a_y_that_is_read_every_few_samples_alone_is_enough(every: int) -> None:
     assert found.std['gap'] < 0.02
 
 
-@pytest.mark.parametrize('rise', [0.1, -0.6])
-def test_a_drift_of_y_is_no_part_of_the_gap_and_is_told(rise: float) -> None:
-    v, y = record()
+@pytest.mark.parametrize(('rise', 'seed'), [(0.1, 1), (-0.6, 1), (0.1, 5), (-0.6, 6)])
+def test_a_drift_of_y_is_no_part_of_the_gap_and_is_told(rise: float, seed: int) -> None:
+    v, y = record(seed=seed)
     found = identify(v, y + np.linspace(0.0, rise, len(y)), PERIOD_S, QUICK)
     assert found.reasons == ()
     assert abs(found.gap - 0.9) < 4.0 * found.std['gap'] < 0.004
