@@ -12,7 +12,7 @@ import numpy as np
 from backlash_ros.core.estimation import settings
 from backlash_ros.core.estimation.fit import FEW_STEPS, FIRST_STEPS, NEAR, Problem
 from backlash_ros.core.estimation.plant_family import PlantFamily
-from backlash_ros.core.estimation.posterior import Prior, WindowFit
+from backlash_ros.core.estimation.posterior import SCALES, Prior, WindowFit
 from backlash_ros.core.estimation.search import search
 from backlash_ros.core.estimation.unmodelled import coasting_score, with_walk
 from backlash_ros.core.law import OutOfBounds
@@ -146,7 +146,7 @@ def afresh(
 
 def mixed(p: Problem, best: WindowFit, others: Sequence[WindowFit] = ()) -> WindowFit:
     """The likeliest of these fits and of others nearby, with the spread of the mixture."""
-    if not (best.credible or best.wiener or coasting_score(p, best) > settings.BY_CHANCE):
+    if best.error_of_G > SCALES[-1] and coasting_score(p, best) < settings.BY_CHANCE:
         best, others = p.likelier_as_told(best), ()
     rival, chance = _wiener(p, best)
     if chance > 0.5:

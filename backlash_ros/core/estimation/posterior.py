@@ -92,14 +92,14 @@ class WindowFit:
     def odds_over(self, other: WindowFit) -> float:
         """Log-odds, by the independent residuals and the priors of xi with the likeliest s >= 1."""
         k = max(len(self.theta) - 3, 1)
-        sizes = (float(np.linalg.norm(f.theta[3:])) / sqrt(k) for f in (self, other))
-        own, its = (0.5 * k * min(x, 1.0) ** 2 + k * log(max(x, 1.0)) for x in sizes)
+        own, its = (0.5 * k * min(f.error_of_G, 1.0) ** 2 + k * log(max(f.error_of_G, 1.0))
+                    for f in (self, other))
         return its - own + self.left.readings / self.inflation * log(other.left.rms / self.left.rms)
 
     @property
-    def credible(self) -> bool:
-        """Whether xi lies within the widest of its priors."""
-        return bool(np.linalg.norm(self.theta[3:]) <= SCALES[-1] * sqrt(len(self.theta) - 3))
+    def error_of_G(self) -> float:
+        """RMS of xi, in prior standard deviations."""
+        return float(np.linalg.norm(self.theta[3:])) / sqrt(max(len(self.theta) - 3, 1))
 
     def behind(self, xi: Array) -> float:
         """Log-likelihood by which another xi (K,) is worse than that of this fit."""

@@ -295,7 +295,7 @@ def _published(setup: Setup, belief: Belief, fit: WindowFit) -> Belief:
 
 def _beside_inherited(setup: Setup, belief: Belief, fit: WindowFit, known: Known) -> Belief:
     # Unexplained motion may be gap as well, and the lost motion of a gear varies with its motion.
-    replacing = 0.05  # std of the gap over the gap below which samples replace what was known
+    replacing, far = 0.05, 5.0  # std of gap over gap, error of G: samples replace nothing beyond
     cov = fit.crossings_cov + (fit.unexplained * fit.gap) ** 2 / 2.0 * np.diag([0.0, 1.0, 1.0])
     (m, c_r, c_l), apart = known.crossings, fit.crossings - known.crossings
     size = np.array([m, c_r - c_l, c_r - c_l])
@@ -305,9 +305,9 @@ def _beside_inherited(setup: Setup, belief: Belief, fit: WindowFit, known: Known
         prior = prior + settings.LOST_MOTION**2 * np.diag(size**2 / [4.0, 2.0, 2.0])
     alike, another = cov + prior, cov + prior + np.diag(size**2)
     if not agree(fit.crossings, known.crossings, alike, settings.CHANCE):
-        # A gear that is not pure play leaves systematic residuals, or moves xi beyond its prior.
+        # A gear that is not pure play leaves systematic residuals, or moves xi too far.
         sure = not fit.systematic and fit.left.turns >= settings.HELD_REVERSALS and \
-            gap_variance(cov) < (replacing * fit.gap) ** 2 and fit.credible
+            gap_variance(cov) < (replacing * fit.gap) ** 2 and fit.error_of_G < far
         if sure and belief.trial.predicted >= belief.trial.must:
             belief = belief._replace(inherited=None)  # it belonged to another plant
         return belief._replace(reason=Status.INCONSISTENT)
