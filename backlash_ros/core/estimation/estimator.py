@@ -170,9 +170,9 @@ class MovingHorizon(Law):
         if self.adapting and not self._recording:
             # Start a new record: samples before the pause do not join those after it.
             before, end = self._belief, self._record.end
-            self._belief = Belief(
-                kept=Kept(first=end), end=end, next_at=end + settings.FIRST_FIT,
-                published=before.published, inherited=before.inherited or before.published)
+            self._belief = Belief(kept=Kept(first=end), end=end, next_at=end + settings.FIRST_FIT,
+                                  published=before.published,
+                                  inherited=before.inherited or before.published)
         self._recording = self.adapting
         self._lost_in_a_row = self._lost_in_a_row + 1 if y is None else 0
         following, family = self._following, self._setup.family

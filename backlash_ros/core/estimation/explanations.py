@@ -165,8 +165,8 @@ def mixed(p: Problem, best: WindowFit, others: Sequence[WindowFit] = ()) -> Wind
     odds = np.array([max(f.evidence - best.evidence, p.log_posterior(f, w) - value) for f in fits])
     share = np.exp(odds - odds.max(initial=-inf))
     for each, f in zip(share / share.sum(), fits, strict=True):
-        wider += each * apart(f, best)
-    return replace(best, spread=wider + chance * apart(rival, best))
+        wider += each * f.apart(best)
+    return replace(best, spread=wider + chance * rival.apart(best))
 
 
 def _wiener(p: Problem, best: WindowFit) -> tuple[WindowFit, float]:
@@ -182,12 +182,6 @@ def _wiener(p: Problem, best: WindowFit) -> tuple[WindowFit, float]:
         if f.valid and (f.left.rms < best.left.rms or coasting_score(p, best) < settings.BY_CHANCE):
             return f, 1.0 / (1.0 + exp(min(best.odds_over(f), 700.0)))
     return best, 0.0
-
-
-def apart(one: WindowFit, other: WindowFit) -> Array:
-    """Outer product (3 + K, 3 + K) of the differences between two fits in m, c_r, c_l, xi."""
-    by = np.append(one.crossings - other.crossings, one.theta[3:] - other.theta[3:])
-    return np.asarray(np.outer(by, by))
 
 
 def _begun_elsewhere(p: Problem, best: WindowFit) -> list[WindowFit]:
@@ -234,7 +228,7 @@ def _along_the_gap(p: Problem, best: WindowFit) -> tuple[Array, list[WindowFit]]
                 break
             behind = max(likeliest - value, 1.0)
             if nearer <= 2.0:  # else the last likely gap may lie far short of this one
-                more = max(0.5 / behind - reach**-2, 0.0) * apart(there, best)
+                more = max(0.5 / behind - reach**-2, 0.0) * there.apart(best)
                 wider = max(wider, more, key=np.trace)
             beside = there if behind < 0.25 * reach**2 else None
             if nearer and behind > 2.0:

@@ -29,7 +29,7 @@ from backlash_ros.core.plant.transfer_function import Array, Family
 
 STEPS, FIRST_STEPS, FEW_STEPS = 16, 6, 3  # limits on the number of Gauss-Newton steps
 NEAR = 0.1, 0.3, 1.0, 1.0  # how far xi moves in the first steps, where the linearization is bad
-NONE = 1e-6  # how far xi moves where it is held
+TIGHT = 1e6  # weight by which an unknown keeps its value
 
 
 class Run(NamedTuple):
@@ -92,7 +92,7 @@ class Problem:
     def holding(self, m: float, c_r: float, c_l: float) -> Problem:
         """The same problem with this backlash, as if known to a millionth."""
         gap, older = max(c_r - c_l, 1e-9 * float(np.ptp(self.v))), self.older
-        known = 1e6 / np.array([m, m * gap, gap])
+        known = TIGHT / np.array([m, m * gap, gap])
         rows = np.vstack([older.rows, np.eye(3, 3 + self.family.count) * known[:, None]])
         older = older._replace(rows=rows, values=np.append(older.values, known * [m, m * c_r, gap]))
         return Problem(self.family, self.v, np.where(self.known, self.y, np.nan), self.nominal,
@@ -181,7 +181,6 @@ class Problem:
     ) -> Array:
         """Least-squares rows of a step: N samples, B priors; target last, (N + B, P + 1)."""
         vague = 100.0  # prior standard deviation of X, over the largest reading
-        tight = 1e6  # weight by which an unknown keeps its value
         run, jacobian, first = self.at(f), self.jacobian(f), self.at(f).v[0]
         _, score, information = run.likelihood
         (_, knots, knot_std), x = self._walk_of(f), padded(f.x, len(run.a) - 1)
@@ -193,11 +192,11 @@ class Problem:
         p0, gap, older = unit[at - 1], unit[at + 2], self.older
         near = zip(unit[at + 3:], f.xi, strict=True) if reach < inf else ()
         begin = sqrt(12.0) / max(f.gap, 1e-9) * (p0 + (first + 0.5 * f.gap) * target) \
-            if isnan(older.v) else tight * (p0 - older.left * gap + older.v * target)
+            if isnan(older.v) else TIGHT * (p0 - older.left * gap + older.v * target)
         beside = [
             # Weak priors: a gap of the size of the swing of v, p0 anywhere in the present gap.
-            tight * (gap + f.gap * target) if held else gap / max(float(np.ptp(self.v)), 1e-300),
-            tight * (p0 + f.p0 * target) if begun else begin, *unit[at + 3:at + 3 + self._leaks],
+            TIGHT * (gap + f.gap * target) if held else gap / max(float(np.ptp(self.v)), 1e-300),
+            TIGHT * (p0 + f.p0 * target) if begun else begin, *unit[at + 3:at + 3 + self._leaks],
             *((row + x * target) / reach for row, x in near),
             # Keeps X finite where no reading determines it, as when the first ones were lost.
             *(row / (vague * max(float(np.abs(self.y).max()), 1e-300)) for row in unit[:len(x)]),
@@ -236,14 +235,12 @@ class Problem:
                 for held in (False, True):
                     _, beside, of_it = self._stepped(f, best, weights, reach, held, not held)
                     if of_it > value:
-                        there = replace(beside, cov=new.cov, scale=new.scale, volume=new.volume)
-                        value = of_it
+                        there, value = beside.known_as(new), of_it
             if not value > best - 50.0:  # f stays, and is known no better than before
                 if reach < inf:  # but it may move if xi is free to
                     near = iter(())
                     continue
-                cov = f.cov if f.cov.size else new.cov
-                return replace(f, cov=cov, scale=new.scale, volume=new.volume)
+                return replace(f.known_as(new), cov=f.cov if f.cov.size else new.cov)
             moved = abs(there.gap - f.gap) / max(sqrt(max(new.cov[2, 2], 0.0)), 1e-300)
             f = there if there.step else self._with_noise(there)
             if value - best < (1.0 if moved < least_move else least_gain):
@@ -261,26 +258,26 @@ class Problem:
             value = self.log_posterior(there, w)
             # Variable projection: another xi needs another X, d, m and o, in which y is linear. And
             # beyond a kink, where the other side is engaged, a second step may succeed.
-            for more in ((NONE, True, True), (reach, held, begun))[:1 + (length == 1.0)]:
+            for more in ((1.0 / TIGHT, True, True), (reach, held, begun))[:1 + (length == 1.0)]:
                 if -inf < value <= best - 0.5:
                     with suppress(np.linalg.LinAlgError):
                         beside = self.towards(there, self.step(there, *more))
                         of_beside = self.log_posterior(beside, w)
                         if of_beside > value:
-                            there, value = beside, of_beside
+                            there, value = beside.known_as(new), of_beside
             if value > best - 0.5:
                 break
-        return new, replace(there, cov=new.cov, scale=new.scale, volume=new.volume), value
+        return new, there, value
 
-    def towards(self, f: WindowFit, new: WindowFit, length: float = 1.0) -> WindowFit:
+    def towards(self, f: WindowFit, new: WindowFit, share: float = 1.0) -> WindowFit:
         """The fit at this share of the way from f to new, or beyond it."""
         furthest = float(np.abs(new.theta[3:] - f.theta[3:]).max(initial=0.0))
-        length *= 2.0 / max(furthest, 2.0)  # xi: two prior deviations a step, at most
+        share *= 2.0 / max(furthest, 2.0)  # xi: two prior deviations a step, at most
         order, knots = max(len(f.x), len(new.x)), self._walk_of(f)[1]
         old, x = padded(f.x, order), padded(new.x, order)
-        return replace(
-            new, x=old + length * (x - old), knots=knots + length * (new.knots - knots),
-            p0=f.p0 + length * (new.p0 - f.p0), theta=f.theta + length * (new.theta - f.theta))
+        return replace(new, x=old + share * (x - old), knots=knots + share * (new.knots - knots),
+                       p0=f.p0 + share * (new.p0 - f.p0),
+                       theta=f.theta + share * (new.theta - f.theta))
 
     def _with_noise(self, f: WindowFit) -> WindowFit:
         """This fit with the noise_std that its residuals show."""

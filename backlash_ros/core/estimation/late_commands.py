@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimation import settings
-from backlash_ros.core.estimation.explanations import Setup, afresh, apart
+from backlash_ros.core.estimation.explanations import Setup, afresh
 from backlash_ros.core.estimation.posterior import Prior, WindowFit
 from backlash_ros.core.plant.backlash import play
 from backlash_ros.core.plant.numerics import basis, lfilter, log_jeffreys
@@ -176,7 +176,7 @@ def weighed(
     if ahead < 0.0:
         record, fit, rival = record.swapped(swapped), rival, fit
         swapped -= frozenset(range(record.first, record.end))
-    wider = apart(rival, fit)
+    wider = rival.apart(fit)
     wider[:3, :3] += rival.crossings_cov
     wider /= 1.0 + exp(min(abs(ahead), 700.0))
     return record, replace(fit, spread=fit.spread + wider), swapped

@@ -121,6 +121,11 @@ class WindowFit:
         cov = by @ self.cov[:3, :3] @ by.T * self.inflation
         return np.asarray(cov + self.spread[:3, :3] if self.spread.ndim else cov)
 
+    def apart(self, other: WindowFit) -> Array:
+        """Outer product (3 + K, 3 + K) of the differences between two fits in m, c_r, c_l, xi."""
+        by = np.append(self.crossings - other.crossings, self.theta[3:] - other.theta[3:])
+        return np.asarray(np.outer(by, by))
+
     def alike(self, other: WindowFit) -> bool:
         """Whether the backlashes of two fits differ by no more than chance."""
         cov = self.crossings_cov + other.crossings_cov
@@ -151,6 +156,10 @@ class WindowFit:
         """The same values with quantization as a part of normal noise, spread and d forgotten."""
         return replace(self, step=0.0, noise_std=self.noise, walk_std=walk_std, knots=np.zeros(0),
                        spread=np.zeros(()))
+
+    def known_as(self, step: WindowFit) -> WindowFit:
+        """These values with the posterior of a step."""
+        return replace(self, cov=step.cov, scale=step.scale, volume=step.volume)
 
     @property
     def valid(self) -> bool:

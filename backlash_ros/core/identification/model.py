@@ -18,7 +18,7 @@ import numpy as np
 from numpy.polynomial.polynomial import polyval
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.fit import STEPS, Problem
+from backlash_ros.core.estimation.fit import STEPS, TIGHT, Problem
 from backlash_ros.core.estimation.posterior import Prior, WindowFit
 from backlash_ros.core.judgement.deviations import covariance_of, effective
 from backlash_ros.core.plant import numerics
@@ -105,9 +105,8 @@ class Samples:
         return self.y[self.first:self.last]
 
     def problem(self, structure: Structure) -> Problem:
-        held = 1e6  # weight that holds m at 1: the gain is in B
         begin, y = self.first - 1 - structure.delay, self.fitted_y
-        prior = Prior(held * np.eye(1, 3 + structure.count), np.full(1, held))
+        prior = Prior(TIGHT * np.eye(1, 3 + structure.count), np.full(1, TIGHT))  # B has the gain
         return Problem(structure, self.v[begin:begin + len(y)], y, 1e-12, prior,
                        self.step, int(self.drifts))
 

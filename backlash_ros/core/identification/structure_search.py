@@ -149,6 +149,7 @@ def _with_general(samples: Samples, delays: Sequence[int]) -> tuple[list[Model],
     better = models[0].squares < 0.9 * best.squares
     return (_of_gaps(samples, models[0]) if better else models), fewer
 
+
 def _of_gaps(samples: Samples, like: Model) -> list[Model]:
     """Fits of the structure of `like` from each local minimum over the gap, the best first."""
     most, apart = 4, 0.005  # minima that are fitted; relative distance of gaps that differ
