@@ -34,11 +34,13 @@ class Truth(NamedTuple):
         return float(v[0]) + self.share * self.gap
 
 
+def two_poles(omega_t: float, damping: float = 0.5) -> TransferFunction:
+    b, a, _ = cont2discrete(([omega_t**2], [1.0, 2.0 * damping * omega_t, omega_t**2]), 1.0)
+    return TransferFunction(b[0, 1:].tolist(), a.tolist())
+
+
 def resonance(frequency_hz: float = 5.0, damping: float = 0.5) -> TransferFunction:
-    w = 2.0 * np.pi * frequency_hz
-    continuous = ([w**2], [1.0, 2.0 * damping * w, w**2])
-    numerator, denominator, _ = cont2discrete(continuous, PERIOD_S, 'zoh')
-    return TransferFunction(numerator[0, 1:].tolist(), denominator.tolist())
+    return two_poles(2.0 * np.pi * frequency_hz * PERIOD_S, damping)
 
 
 def swing(count: int, size: float = 3.0, seed: int = 0) -> Array:

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from backlash_ros.core import Parameters, Status, build_controller, build_reference
 from backlash_ros.core.estimation.explanations import Setup, afresh
-from backlash_ros.core.estimation.late_commands import likelier
+from backlash_ros.core.estimation.late_commands import likelier, weighed
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.parameters import Bounds
 from backlash_ros.core.plant.backlash import play
@@ -89,3 +89,22 @@ def test_late_commands_around_an_integrator_do_not_mislead(seed: int) -> None:
     assert Status.INCONSISTENT not in states
     assert states[-1] is Status.TRACKING
     assert np.abs(errors).max() < 5e-3
+
+
+@pytest.mark.parametrize('late', [False, True])
+def test_commands_that_look_late_are_weighed_against_those_expected(late: bool) -> None:
+    rng = np.random.default_rng(5)
+    v = np.cumsum(rng.normal(0.0, 0.6, 160))
+    other = np.append(np.nan, v[:-1])
+    v[100], other[100] = (v[99], v[100]) if late else (v[100], v[99])
+    family = PlantFamily(TransferFunction([0.3], [1.0, -0.7]), 0.0)
+    y = lfilter([0.3], [1.0, -0.7], play(v, 1.0, v[0]) - 0.5) + rng.normal(0.0, 0.05, len(v))
+    setup = Setup(family, 0.05, Bounds((0.1, 10.0), (-5.0, 5.0), (-5.0, 5.0)), 10.0, 1.0, 0.0,
+                  np.zeros(3))
+    looked = Window(0, v, y, other) if late else Window(0, v, y, other).swapped(frozenset({100}))
+    fit = afresh(setup, looked)
+    assert fit is not None
+    record, found, swapped = weighed(setup, looked, fit, frozenset({100}), None)
+    assert swapped == (frozenset({100}) if late else frozenset())
+    np.testing.assert_array_equal(record.v, v)
+    assert abs(found.gap - 1.0) < 5.0 * found.gap_std < 0.5
