@@ -136,7 +136,7 @@ def afresh(
     if not different:  # slopes of 0, or even the best one has diverged
         return None
     likely = different[0].evidence - settings.FAR_BEHIND
-    fits = [p.finished(p.fitted(f)) for f in different if f.evidence > likely]
+    fits = [p.finished(p.fitted(f)) for f in different if f.evidence >= likely]
     best = max(fits, key=lambda f: f.evidence)
     if best.m < 0.0 or (older is None and best.left.turns < setup.turns_needed):
         return best  # not known, however precise it is

@@ -253,7 +253,7 @@ def _doubted(setup: Setup, record: Window, before: Belief) -> Belief:
     short = max(SHORT_RECORD, 4 * setup.family.memory)
     explained, whole = settings.AS_GOOD * held.noise, None
     if count <= max(short, 4 * newer) and count < settings.LONGEST:
-        whole = afresh(setup, record, walks=newer >= 2 * PREDICTED)
+        whole = afresh(setup, record, older=kept.older, walks=newer >= 2 * PREDICTED)
         if whole is not None and not whole.left.rms < explained:
             whole = None
     for first in (since, (since + record.end) // 2):
@@ -269,7 +269,7 @@ def _doubted(setup: Setup, record: Window, before: Belief) -> Belief:
             return after._replace(found=found)
         return _adopted(setup, part, found, held.prior_of_xi, after)
     if whole is not None and setup.is_known(whole):
-        return _adopted(setup, record, whole, None, after)
+        return _adopted(setup, record, whole, kept.older, after)
     # Give up after the time that two reversals of the record take on average.
     if newer > max(short, 2 * count // max(held.left.turns, 1)):
         return _begun_anew(after, since, record.end, record.end + 1)

@@ -10,7 +10,7 @@ from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR
 from backlash_ros.core.estimation.explanations import Setup, afresh
 from backlash_ros.core.estimation.fit import FEW_STEPS, Problem
 from backlash_ros.core.estimation.plant_family import PlantFamily
-from backlash_ros.core.estimation.posterior import WindowFit
+from backlash_ros.core.estimation.posterior import WindowFit, error_of_plant
 from backlash_ros.core.estimation.search import search
 from backlash_ros.core.parameters import Bounds, Parameters
 from backlash_ros.core.plant.backlash import play
@@ -174,6 +174,20 @@ def test_a_wrong_sign_is_named_only_where_it_is_certain() -> None:
         cov = np.diag([std**2, 0.01, 0.01])
         fit = WindowFit(np.zeros(1), 0.0, np.array([-1.0, 0.1, 1.0]), 1e-3, cov=cov)
         assert setup.moves_against(fit) is named
+
+
+@pytest.mark.parametrize('seed', range(8))
+def test_what_readings_tell_well_is_kept_while_the_size_of_the_error_is_open(seed: int) -> None:
+    # Some directions of xi are known a thousand times as well as others.
+    rng, xi_std, noise, freedom = np.random.default_rng(seed), 0.4, 0.45, 30.0
+    turned = np.linalg.qr(rng.normal(size=(5, 5)))[0]
+    rows = np.array([3e4, 900.0, 180.0, 45.0, 20.0])[:, None] * turned
+    xi = xi_std * rng.normal(size=5)
+    r = np.vstack([np.column_stack([rows, rows @ xi + noise * rng.normal(size=5)]), np.zeros(6)])
+    fit = WindowFit(np.zeros(1), 0.0, np.zeros(8), 1.0)
+    mean, cov, *_ = error_of_plant(fit, r, freedom * noise**2, freedom)
+    assert np.sum((rows @ (mean - xi)) ** 2) < 30.0 * noise**2  # chi-square of five: 1e-5
+    assert np.all(np.abs(mean - xi) < 5.0 * np.sqrt(np.diag(cov)))
 
 
 def test_a_fit_that_begins_at_its_optimum_ends_there() -> None:
