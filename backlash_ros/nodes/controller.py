@@ -186,7 +186,8 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
                 self.loops.end(self.settings.on_stop)
                 self._send_last()
                 for joint in self.joints:
-                    joint.publish_model(wait_s=1)
+                    if not joint.loop.silent:  # else told when the silence was noticed
+                        joint.publish_model(wait_s=1)
             self._rivals.follow(active=False)
             self._diagnose()
         return TransitionCallbackReturn.SUCCESS
@@ -322,7 +323,12 @@ class ControllerNode(LifecycleNodeMixin, ProcessNode):
         for joint in self.joints:
             if 0.0 < joint.p.estimates.save_period < time.monotonic() - joint.saved_at:
                 joint.save()
-        if self.loops.give_up_silent():
+        overdue = self.loops.overdue
+        for joint in self.joints:
+            if joint.loop in overdue:
+                joint.publish_model()  # what it has learned of the noise is given up with it
+                joint.loop.give_up()
+        if overdue:
             if self._ending is None:
                 step_s = max(self.settings.sample_period, 1e-3)
                 self._ending = self.every(step_s, self._send_next)

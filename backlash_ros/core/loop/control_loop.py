@@ -1,7 +1,7 @@
 """From outputs to commands, for all joints: count → learn → control → limit → send → note."""
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from enum import Enum
 from itertools import cycle
@@ -378,12 +378,11 @@ class JointLoops:
         for joint, value in y_m.items():
             self.by_name[joint].take_reference(value)
 
-    def give_up_silent(self) -> bool:
-        """Give up joints that are newly silent, or all that go together; return whether any is."""
+    @property
+    def overdue(self) -> Sequence[ControlLoop]:
+        """Joints that are newly silent, or all that go together, to be given up."""
         overdue = [loop for loop in self.loops if loop.is_overdue]
-        for loop in self.loops if overdue and self._together else overdue:
-            loop.give_up()
-        return bool(overdue)
+        return self.loops if overdue and self._together else overdue
 
     def end(self, action: str) -> list[ControlLoop]:
         """As ControlLoop.end, for the loops that command; return these."""

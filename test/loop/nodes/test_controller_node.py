@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from lifecycle_msgs.msg import Transition
 from node_in_process import Bench, bench, look_for_silence, node_with
+from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
+from backlash_ros import topics
 from backlash_ros.core.loop.control_loop import Phase
 from backlash_ros.tools.bringup.supervisor import free_domain
 
@@ -99,6 +101,21 @@ def test_the_commands_of_a_silence_are_as_on_timeout_says(action: str) -> None:
         assert made.loop.statistics.interruptions == 1
         assert made.loop.phase is Phase.RUNS
         assert np.abs(np.diff(made.sent)).max() <= STEP
+
+
+def test_a_silence_before_the_end_takes_back_nothing_that_was_told_of_the_noise() -> None:
+    with bench() as made:
+        told = made.probe.collect(topics.MODEL, Float64MultiArray)
+        made.wait_until(lambda: made.probe.node.count_publishers(topics.MODEL), 'a publisher')
+        made.run(400)
+        look_for_silence(made.node)
+        made.wait_until(lambda: told, topics.MODEL)
+        assert made.change(DEACTIVATE)
+        for _ in range(20):
+            made.serve()
+        index = sum(dim.size for dim in told[-1].layout.dim[:-2])
+        assert told[-1].layout.dim[-2].label == 'noise_ratio'
+        assert told[-1].data[index] == pytest.approx(1.0, rel=0.2)
 
 
 def test_estimates_are_frozen_reset_and_compensated_with_as_is_asked() -> None:
