@@ -186,7 +186,7 @@ def error_of_plant(
     each = volumes - 0.5 * (left if f.step else freedom * np.log(left))[:, 0]
     share = np.exp(each - each.max())
     share /= share.sum()
-    means = scales**2 * singular * z / (noise + seen)
+    means = scales**2 * singular * z / (noise + seen)  # shrink is of the noise before
     mean = share @ means
     spread = np.diag(share @ (scales**2 * shrink)) + (means - mean).T * share @ (means - mean)
     best = int(each.argmax())

@@ -1,6 +1,5 @@
 """Parts of the fit on their own: the family of G(z; xi), readings, the search, the observer."""
 
-
 import numpy as np
 import pytest
 from records import moves_with_rests, resonance, two_poles
